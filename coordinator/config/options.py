@@ -6,13 +6,13 @@ handed back.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawOption, RawSection
-from coordinator.support.quoting import nearest, shown
+from coordinator.support.quoting import nearest, nearest_or_all, shown
 
 T = TypeVar("T")
 _FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
@@ -410,6 +410,14 @@ class SectionReader:
         return ConfigError(
             self.place_of(option), f"option '{option.name}' of [{self.name}]{given} {sentence}"
         )
+
+    def unknown(
+        self, option: Option[Any], name: str, known: Iterable[str], pattern: str = "{}"
+    ) -> ConfigError:
+        """Return the error for an option that names NAME, which is none of KNOWN."""
+        hint = nearest_or_all(name, known, pattern=pattern)
+        sentence = f"'{option.name}' of [{self.name}] names {shown(name)}, which does not exist{hint}"
+        return ConfigError(self.place_of(option), sentence)
 
     def finish(self) -> tuple[RawOption, ...]:
         """Return the options that wait for their module; raises ConfigError for one of no use here."""

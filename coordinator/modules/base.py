@@ -18,7 +18,7 @@ A restart makes new modules: all state is in the object. Everything happens on t
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from coordinator.config.errors import ConfigError, NotSupported, Place
+from coordinator.config.errors import NotSupported, Place
 from coordinator.config.file import RawSection
 from coordinator.config.model import MachineDescription
 from coordinator.config.options import BadValue, ListOption, Option, SectionReader, SectionSpec
@@ -27,7 +27,6 @@ from coordinator.gcode.commands import Call, GCodeCommand, Reading
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.machine import Modules
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest, shown
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
@@ -229,12 +228,7 @@ class Build:
                     raise NotSupported(
                         self.reader.place_of(option), f"it needs [{name}], which is not supported yet"
                     )
-                others = modules.names(kind)
-                hint = nearest(name, others, pattern="[{}]") or f"; there is {', '.join(others) or 'none'}"
-                raise ConfigError(
-                    self.reader.place_of(option),
-                    f"'{option.name}' of [{self.name}] names {shown(name)}, which does not exist{hint}",
-                )
+                raise self.reader.unknown(option, name, modules.names(kind), "[{}]")
             return found
 
         return find

@@ -14,7 +14,7 @@ from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import UNSUPPORTED_EXTRUDER_OPTIONS
 from coordinator.kinematics.base import FILAMENT, StepFunction, WorkSpace
 from coordinator.motion.specs import MotionLimits
-from coordinator.support.quoting import nearest
+from coordinator.support.quoting import nearest_or_all
 
 NOZZLE_DIAMETER = FloatOption(
     name="nozzle_diameter", help="bore of the nozzle", unit="mm", above=0, maximum=20
@@ -174,7 +174,7 @@ def _read_follower(
     followed = next((extruder for extruder in extruders if extruder.name == name), None)
     if name and followed is None:
         names = tuple(extruder.name for extruder in extruders)
-        hint = nearest(name, names) or f"; there is {', '.join(names) or 'none'}"
+        hint = nearest_or_all(name, names)
         raise reader.bad(FOLLOWED, f"but there is no such extruder{hint}")
     _check_advance(reader, followed)
     active = followed is not None and followed is extruders[0]

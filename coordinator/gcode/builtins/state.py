@@ -1,11 +1,12 @@
 """Where a program's numbers point: offsets of the origin, states that are saved and restored, all frames."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from coordinator.gcode.commands import ProgramContext
 from coordinator.gcode.events import Reply
-from coordinator.gcode.machine_state import SavedState
+from coordinator.gcode.machine_state import DEFAULT_STATE, SavedState
+from coordinator.gcode.parameters import flag
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.gcode.status import frames, motion_figures
 from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus, Planner
@@ -14,18 +15,6 @@ MOVE_SPEED_MM_S: Final = 50.0
 """Of the moves that these commands make, unless they say otherwise."""
 SAVED_MAX: Final = 100
 """States that may be kept."""
-_DEFAULT_STATE: Final = "default"
-
-
-def _parameters(command: Command, known: Collection[str]) -> Mapping[str, str]:
-    return command.only_parameters(known)
-
-
-def _flag(command: Command, values: Mapping[str, str], key: str) -> bool:
-    text = values.get(key, "0")
-    if text not in {"0", "1"}:
-        raise WordError(f"{key} of {command.name} is {quoted(text)}; give 0 or 1")
-    return text == "1"
 
 
 def _speed(job: ProgramContext, command: Command, values: Mapping[str, str], otherwise_mm_s: float) -> float:
@@ -54,7 +43,7 @@ def set_gcode_offset(job: ProgramContext, command: Command) -> bool:
     Beside a job, MOVE makes the job's next move also make up for the change: it does not stop for it.
     """
     adjust = [f"{axis}_ADJUST" for axis in AXIS_LETTERS]
-    values = _parameters(command, (*AXIS_LETTERS, *adjust, "MOVE", "MOVE_SPEED"))
+    values = command.only_parameters((*AXIS_LETTERS, *adjust, "MOVE", "MOVE_SPEED"))
     planner = job.planner
     before = dict(zip(AXIS_LETTERS, planner.gcode_offset, strict=True))
     after: dict[str, float] = {}
@@ -64,7 +53,7 @@ def set_gcode_offset(job: ProgramContext, command: Command) -> bool:
         elif f"{axis}_ADJUST" in values:
             after[axis] = before[axis] + number(command.name, values, f"{axis}_ADJUST")
     change = {axis: value - before[axis] for axis, value in after.items()}
-    if _flag(command, values, "MOVE") and any(change.values()):
+    if flag(command, values, "MOVE") and any(change.values()):
         if job.while_printing:
             _check_reach(job, change)
             for axis, distance in change.items():
@@ -97,7 +86,7 @@ def _check_reach(job: ProgramContext, change: Mapping[str, float]) -> None:
 
 def save_gcode_state(job: ProgramContext, command: Command) -> bool:
     """NAME: keep modes, speed, factors, origin, offset and position."""
-    name = _parameters(command, ("NAME",)).get("NAME", _DEFAULT_STATE)
+    name = command.only_parameters(("NAME",)).get("NAME", DEFAULT_STATE)
     save_state(job, name)
     return True
 
@@ -128,13 +117,13 @@ def present_state(planner: Planner) -> SavedState:
 
 def restore_gcode_state(job: ProgramContext, command: Command) -> bool:
     """NAME: let all that be as it was; MOVE=1: also go back to where X Y Z were."""
-    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
-    name = values.get("NAME", _DEFAULT_STATE)
+    values = command.only_parameters(("NAME", "MOVE", "MOVE_SPEED"))
+    name = values.get("NAME", DEFAULT_STATE)
     saved = job.machine.saved.get(name)
     if saved is None:
         has = f"there is {', '.join(job.machine.saved)}" if job.machine.saved else "none is saved"
         raise WordError(f"{command.name} names the state {quoted(name)}, which is not saved; {has}")
-    speed = _speed(job, command, values, saved.speed_mm_s) if _flag(command, values, "MOVE") else None
+    speed = _speed(job, command, values, saved.speed_mm_s) if flag(command, values, "MOVE") else None
     return restore_state(job, saved, speed)
 
 

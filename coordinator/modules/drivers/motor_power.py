@@ -10,7 +10,7 @@ from typing import Final
 from coordinator.config.pins import PinDescription
 from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading
 from coordinator.gcode.events import Done
-from coordinator.gcode.parser import WordError, quoted
+from coordinator.gcode.parameters import flag, one
 from coordinator.modules.base import Build, Module
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
@@ -100,17 +100,11 @@ class MotorPower(Module):
 
     def _read_one(self, call: Call) -> Reading:
         values = call.parameters("STEPPER", "ENABLE")
-        name, enable = values.get("STEPPER", ""), values.get("ENABLE", "1")
-        names = [stepper for line in self._lines for stepper in line.steppers]
-        if name not in names:
-            raise WordError(
-                f"SET_STEPPER_ENABLE names {quoted(name)}; motors with enable pins: {' '.join(names)}"
-            )
-        if enable not in ("0", "1"):
-            raise WordError(f"ENABLE of SET_STEPPER_ENABLE is {quoted(enable)}; it must be 0 or 1")
+        name = one(call.command, values, "STEPPER", self.are_on())
+        enable = flag(call.command, {"ENABLE": "1", **values}, "ENABLE")
         lines = [line for line in self._lines if name in line.steppers]
-        done = Done(unhomed="" if enable == "1" else self._moved_by(lines))
-        return AtStandstill(lambda: self._some(lines, enable == "1", done), done)
+        done = Done(unhomed="" if enable else self._moved_by(lines))
+        return AtStandstill(lambda: self._some(lines, enable, done), done)
 
     def _moved_by(self, lines: "Iterable[EnableLine]") -> str:
         """Return the letters of the axes whose place is not sure when the motors of LINES are off."""

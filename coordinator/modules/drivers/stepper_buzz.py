@@ -6,7 +6,7 @@ from typing import Final
 from coordinator.config.model import StepperDescription
 from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
-from coordinator.gcode.parser import WordError, quoted
+from coordinator.gcode.parameters import one
 from coordinator.modules.base import Build, Module
 from coordinator.runtime.moves.single import Ramp, SingleMove
 
@@ -27,12 +27,8 @@ class StepperBuzz(Module):
         build.add_command("STEPPER_BUZZ", "Move the motor STEPPER to and fro ten times, by 1 mm", self._read)
 
     def _read(self, call: Call) -> Reading:
-        name = call.parameters("STEPPER").get("STEPPER", "")
-        stepper = self._steppers.get(name)
-        if stepper is None:
-            raise WordError(
-                f"STEPPER_BUZZ names the motor {quoted(name)}; there are {' '.join(self._steppers)}"
-            )
+        name = one(call.command, call.parameters("STEPPER"), "STEPPER", self._steppers)
+        stepper = self._steppers[name]
         done = Done(position=call.position, moved=True)  # it ends where it began, to the step
 
         async def buzz() -> Done:

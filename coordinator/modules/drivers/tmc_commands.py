@@ -7,10 +7,10 @@ from coordinator.config.pins import PinDescription
 from coordinator.drivers.tmc_chips import Field
 from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
+from coordinator.gcode.parameters import one, value
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import one, parameters, value
-from coordinator.support.quoting import nearest
+from coordinator.support.quoting import nearest_or_all
 from nodes.devices.tmcuart import TmcUart
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class TmcCommands(Module):
         return self._drivers[one(call.command, given, "STEPPER", self._drivers)]
 
     def _init(self, call: Call) -> Reading:
-        driver = self._driver(call, parameters(call.command, ("STEPPER",)))
+        driver = self._driver(call, call.parameters("STEPPER"))
 
         async def perform() -> Done:
             await driver.set_up()
@@ -85,7 +85,7 @@ class TmcCommands(Module):
         return AtStandstill(perform)
 
     def _dump(self, call: Call) -> Reading:
-        given = parameters(call.command, ("STEPPER", "REGISTER"))
+        given = call.parameters("STEPPER", "REGISTER")
         driver = self._driver(call, given)
         only = one(call.command, given, "REGISTER", driver.CHIP.registers) if "REGISTER" in given else ""
 
@@ -95,7 +95,7 @@ class TmcCommands(Module):
         return AtStandstill(perform)
 
     def _set_current(self, call: Call) -> Reading:
-        given = parameters(call.command, ("STEPPER", "CURRENT", "HOLDCURRENT"))
+        given = call.parameters("STEPPER", "CURRENT", "HOLDCURRENT")
         driver = self._driver(call, given)
         most = driver.settings.largest_a
         for name in ("CURRENT", "HOLDCURRENT"):
@@ -114,13 +114,13 @@ class TmcCommands(Module):
         return AtStandstill(perform)
 
     def _set_field(self, call: Call) -> Reading:
-        given = parameters(call.command, ("STEPPER", "FIELD", "VALUE", "VELOCITY"))
+        given = call.parameters("STEPPER", "FIELD", "VALUE", "VELOCITY")
         driver = self._driver(call, given)
         name = given.get("FIELD", "").lower()
         register = driver.CHIP.field_register(name)
         if register is None:
             names = driver.CHIP.writable_fields
-            hint = nearest(name, names) or f"; there is {', '.join(names)}"
+            hint = nearest_or_all(name, names)
             raise WordError(f"SET_TMC_FIELD: there is no field {quoted(name)}{hint}")
         field = register.field(name)
         number = self._field_value(call, driver, given, field)

@@ -28,7 +28,7 @@ from coordinator.modules.drivers.tmc_options import (
 )
 from coordinator.modules.homing.virtual_endstop import StallEndstop
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest, shown
+from coordinator.support.quoting import nearest_or_all, shown
 from coordinator.support.values import Value
 from nodes.devices.tmcuart import TmcError
 from nodes.node.node import Node
@@ -290,7 +290,7 @@ def _stepper(build: Build) -> "StepperDescription":
     found = steppers.get(build.instance)
     if found is None:
         build.needs_acting(build.instance)
-        hint = nearest(build.instance, steppers) or f"; there is {', '.join(steppers)}"
+        hint = nearest_or_all(build.instance, steppers)
         raise ConfigError(
             build.place,
             f"[{build.name}] refers to unknown stepper {shown(build.instance)}{hint}",

@@ -2,7 +2,6 @@
 
 from typing import ClassVar, Final
 
-from coordinator.config.errors import ConfigError
 from coordinator.config.options import FloatOption, IntOption, ListOption, SectionSpec
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.drivers.motor_power import MotorPower
@@ -16,7 +15,6 @@ from coordinator.modules.fans.fan_unit import (
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest, shown
 
 LOOK_S: Final = 1.0
 FULL: Final = shutdown_speed(1.0)
@@ -74,11 +72,7 @@ class _HeaterNames:
             if name in known:
                 found.append(known[name])
             elif self._given and not modules.is_left_out(name):
-                hint = nearest(name, tuple(known)) or f"; there is {', '.join(known) or 'none'}"
-                raise ConfigError(
-                    self._reader.place_of(self._option),
-                    f"'heater' of [{self._reader.name}] names {shown(name)}, which does not exist{hint}",
-                )
+                raise self._reader.unknown(self._option, name, known)
         return found
 
 
@@ -158,11 +152,7 @@ class ControllerFan(FanModule):
         given = build.find(STEPPER)
         for name in given or ():
             if name not in known:
-                hint = nearest(name, known) or f"; there is {', '.join(known)}"
-                raise ConfigError(
-                    build.reader.place_of(STEPPER),
-                    f"'stepper' of [{build.name}] names {shown(name)}, which does not exist{hint}",
-                )
+                raise build.reader.unknown(STEPPER, name, known)
         return given or tuple(known)
 
     def link(self, modules: Modules) -> None:

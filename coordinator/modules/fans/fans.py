@@ -4,6 +4,7 @@ from typing import ClassVar, Final
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import Call, Reading, Synchronized
+from coordinator.gcode.parameters import numbers, one, value
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.fans.fan_unit import (
@@ -13,7 +14,6 @@ from coordinator.modules.fans.fan_unit import (
     fan_options,
     shutdown_speed,
 )
-from coordinator.modules.words import numbers, one, parameters, value
 
 OFF: Final = shutdown_speed(0.0)
 FULL: Final = 255.0
@@ -65,7 +65,7 @@ class GenericFans(Module):
         )
 
     def _set(self, call: Call) -> Reading:
-        given = parameters(call.command, ("FAN", "SPEED"))
+        given = call.parameters("FAN", "SPEED")
         unit = self.units[one(call.command, given, "FAN", self.units)]
         speed = value(call.command, given, "SPEED", 0.0)
         if not 0 <= speed <= 1:

@@ -14,6 +14,7 @@ from coordinator.config.sections.sensor_options import (
     UNSUPPORTED_SENSOR_OPTIONS,
 )
 from coordinator.gcode.commands import Call, Reading, Synchronized
+from coordinator.gcode.parameters import one, value
 from coordinator.gcode.parser import WordError
 from coordinator.heat.controller import Controller
 from coordinator.heat.pid import Pid, PidGains
@@ -30,7 +31,6 @@ from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
-from coordinator.modules.words import one, parameters, value
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
@@ -72,7 +72,7 @@ class TemperatureFans(Module):
 
     def _set(self, call: Call) -> Reading:
         command = call.command
-        given = parameters(command, ("TEMPERATURE_FAN", "TARGET", "MIN_SPEED", "MAX_SPEED"))
+        given = call.parameters("TEMPERATURE_FAN", "TARGET", "MIN_SPEED", "MAX_SPEED")
         fan = self.by_name[one(command, given, "TEMPERATURE_FAN", self.by_name)]
         target = value(command, given, "TARGET", fan.usual_target_c)
         low = value(command, given, "MIN_SPEED", fan.min_speed)

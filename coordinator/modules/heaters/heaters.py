@@ -5,13 +5,13 @@ from typing import Final
 
 from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading, Synchronized
 from coordinator.gcode.events import Done
+from coordinator.gcode.parameters import numbers, one, value
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.tuning import calibrate_mpc, calibrate_pid
 from coordinator.modules.sensors.temperature_source import TemperatureSource
-from coordinator.modules.words import numbers, one, parameters, value
 from coordinator.support.values import Value
 
 FAN_STEPS_MAX: Final = 12
@@ -111,7 +111,7 @@ class HeaterRegistry(Module):
         return Immediate((self.temperatures(),), kind=ReplyKind.PLAIN)
 
     def _turn_off(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(_: float) -> None:
             for unit in self.units.values():
@@ -124,12 +124,12 @@ class HeaterRegistry(Module):
         return names[one(call.command, given, "HEATER", names)]
 
     def _set(self, call: Call) -> Reading:
-        given = parameters(call.command, ("HEATER", "TARGET"))
+        given = call.parameters("HEATER", "TARGET")
         return self.set_in_time(self._unit(call, given), value(call.command, given, "TARGET", 0.0))
 
     def _wait(self, call: Call) -> Reading:
         command = call.command
-        given = parameters(command, ("SENSOR", "MINIMUM", "MAXIMUM"))
+        given = call.parameters("SENSOR", "MINIMUM", "MAXIMUM")
         source = self.sensors[one(command, given, "SENSOR", self.sensors)]
         if not given.keys() & {"MINIMUM", "MAXIMUM"}:
             raise WordError("TEMPERATURE_WAIT needs MINIMUM= or MAXIMUM=, or both")
@@ -146,7 +146,7 @@ class HeaterRegistry(Module):
         return AtStandstill(perform)
 
     def _query(self, call: Call) -> Reading:
-        given = parameters(call.command, ("NAME", "PULLUP"))
+        given = call.parameters("NAME", "PULLUP")
         names = [name for name, source in self.sensors.items() if source.ratio is not None]
         if "NAME" not in given:
             return Immediate(
@@ -162,12 +162,12 @@ class HeaterRegistry(Module):
         return Immediate((told,))
 
     def _pid(self, call: Call) -> Reading:
-        given = parameters(call.command, ("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE"))
+        given = call.parameters("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE")
         unit, target = self._unit(call, given), value(call.command, given, "TARGET")
         return self._calibration(unit, target, lambda: calibrate_pid(unit, target))
 
     def _mpc(self, call: Call) -> Reading:
-        given = parameters(call.command, ("HEATER", "TARGET", "FAN_BREAKPOINTS"))
+        given = call.parameters("HEATER", "TARGET", "FAN_BREAKPOINTS")
         unit, target = self._unit(call, given), value(call.command, given, "TARGET", 200.0)
         steps = round(value(call.command, given, "FAN_BREAKPOINTS", 3.0))
         if not 2 <= steps <= FAN_STEPS_MAX:

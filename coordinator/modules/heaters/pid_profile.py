@@ -7,13 +7,13 @@ from coordinator.config.errors import ConfigError
 from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.config.sections.heater_options import PID_KD, PID_KI, PID_KP
 from coordinator.gcode.commands import Call, Immediate, Reading, Synchronized
+from coordinator.gcode.parameters import one, value
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.heaters import HeaterRegistry
-from coordinator.modules.words import one, parameters, value
-from coordinator.support.quoting import nearest, shown
+from coordinator.support.quoting import nearest_or_all, shown
 from coordinator.support.values import Value
 
 KIND: Final = "pid_profile"
@@ -64,7 +64,7 @@ class PidProfiles(Module):
     def _read(self, call: Call) -> Reading:
         command = call.command
         known = (*ACTIONS, *GAINS, "HEATER", "KEEP_TARGET", "VERBOSE", "DEFAULT", "TARGET", "TOLERANCE")
-        given = parameters(command, known)
+        given = call.parameters(*known)
         actions = [action for action in ACTIONS if action in given]
         if len(actions) != 1:
             raise WordError(f"PID_PROFILE needs one of {', '.join(ACTIONS)}")
@@ -93,7 +93,7 @@ class PidProfiles(Module):
             gains = self._find(unit, name)
         if gains is None:
             names = [DEFAULT, *self._of.get(unit.key, {})]
-            hint = nearest(name, names) or f"; there is {', '.join(names)}"
+            hint = nearest_or_all(name, names)
             raise WordError(f"PID_PROFILE: {unit.key} has no profile {quoted(name)}{hint}")
         return self._use(call, given, unit, name, gains)
 

@@ -12,13 +12,13 @@ from coordinator.config.sections.heater_options import (
     UNSUPPORTED_HEATER_OPTIONS,
 )
 from coordinator.gcode.commands import Call, Reading
+from coordinator.gcode.parameters import numbers
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.heaters.pid_profile import PidProfiles
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
-from coordinator.modules.words import numbers
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 

@@ -7,7 +7,7 @@ from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.heat.verify import VerifyOptions, default_options
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heaters import HeaterRegistry
-from coordinator.support.quoting import nearest
+from coordinator.support.quoting import nearest_or_all
 
 MAX_ERROR: Final = FloatOption(
     name="max_error",
@@ -72,7 +72,7 @@ class VerifyHeater(Module):
         if self.heater not in known:
             if modules.is_left_out(self.heater):
                 raise NotSupported(self.place, f"the heater {self.heater} is not supported yet")
-            hint = nearest(self.heater, known) or f"; there is {', '.join(known) or 'none'}"
+            hint = nearest_or_all(self.heater, known)
             raise ConfigError(self.place, f"[{self.name}] refers to an unknown heater{hint}")
         assert heaters is not None
         heaters.units[self.heater].watch(self.options)

@@ -22,10 +22,10 @@ from coordinator.gcode.commands import (
     ToProgram,
 )
 from coordinator.gcode.events import Done, PositionSet, WeightsChange
+from coordinator.gcode.parameters import flag, one, value
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing import Homing
-from coordinator.modules.words import flag, one, parameters, value
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
@@ -183,12 +183,12 @@ class Skews(Module):
     # ------------------------------------------------------------------------------------------ commands
 
     def _restore(self, call: Call) -> Reading:
-        given = parameters(call.command, _PLANES)
+        given = call.parameters(*_PLANES)
         skew = Skew(**{plane.lower(): value(call.command, given, plane, 0.0) for plane in _PLANES})
         return ToProgram(lambda job: self.take(job, skew))
 
     def _set(self, call: Call) -> Reading:
-        given = parameters(call.command, (*_PLANES, "CLEAR"))
+        given = call.parameters(*_PLANES, "CLEAR")
         if flag(call.command, given, "CLEAR"):
             return ToProgram(lambda job: self.take(job, Skew()))
         measured = {
@@ -205,16 +205,16 @@ class Skews(Module):
         return ToProgram(act)
 
     def _tell(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
         return Immediate(tuple(f"{plane}: {_told(getattr(self.now, plane.lower()))}" for plane in _PLANES))
 
     def _calculate(self, call: Call) -> Reading:
-        given = parameters(call.command, ("AC", "BD", "AD"))
+        given = call.parameters("AC", "BD", "AD")
         ac, bd, ad = (value(call.command, given, name) for name in ("AC", "BD", "AD"))
         return Immediate((f"Calculated skew: {_told(skew_of(call.command, ac, bd, ad))}",))
 
     def _manage(self, call: Call) -> Reading:
-        given = parameters(call.command, ("LOAD", "SAVE"))
+        given = call.parameters("LOAD", "SAVE")
         if len(given) != 1:
             raise WordError("SKEW_PROFILE takes LOAD=name or SAVE=name; to remove one, remove its section")
         if "LOAD" in given:

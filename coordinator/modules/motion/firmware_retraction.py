@@ -6,9 +6,9 @@ from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.commands import Call, Immediate, Lines, Reading
+from coordinator.gcode.parameters import bounded
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import bounded, parameters
 from coordinator.support.values import Value
 
 LENGTH = FloatOption(
@@ -114,7 +114,7 @@ class FirmwareRetraction(Module):
     def _set(self, call: Call) -> Reading:
         command = call.command
         options = {option.name.upper(): option for option in (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP)}
-        values = parameters(command, options)
+        values = call.parameters(*options)
         if not values:
             raise WordError(f"SET_RETRACTION names nothing; it takes {' '.join(options)}")
         changes = {}

@@ -10,6 +10,7 @@ from typing import Final
 from coordinator.config.options import BoolOption, SectionSpec
 from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
+from coordinator.gcode.parameters import bounded, needed, one
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.runtime.moves.single import Ramp, SingleMove
@@ -51,14 +52,13 @@ class ForceMove(Module):
 
     def _read_move(self, call: Call) -> Reading:
         values = call.parameters("STEPPER", "DISTANCE", "VELOCITY", "ACCEL")
-        name = values.get("STEPPER", "")
-        names = [stepper.name for stepper in self._machine.steppers]
-        if name not in names:
-            raise WordError(f"FORCE_MOVE names the motor {quoted(name)}; there are {' '.join(names)}")
-        distance = _number(call, values, "DISTANCE", -DISTANCE_MAX_MM, DISTANCE_MAX_MM)
-        speed = _number(call, values, "VELOCITY", 1e-3, SPEED_MAX)
+        name = one(call.command, values, "STEPPER", (s.name for s in self._machine.steppers))
+        for key in ("DISTANCE", "VELOCITY"):
+            needed(call.command, values, key)
+        distance = bounded(call.command, values, "DISTANCE", 0.0, low=-DISTANCE_MAX_MM, high=DISTANCE_MAX_MM)
+        speed = bounded(call.command, values, "VELOCITY", 0.0, low=1e-3, high=SPEED_MAX)
         limits = self._machine.limits
-        accel = _number(call, values, "ACCEL", 0.0, ACCEL_MAX) if "ACCEL" in values else 0.0
+        accel = bounded(call.command, values, "ACCEL", 0.0, low=0.0, high=ACCEL_MAX)
         of_head = name in [motor.name for motor in self._machine.motors]
         done = Done(position=call.position, unhomed=_AXES if of_head else "", moved=True)
 
@@ -81,7 +81,7 @@ class ForceMove(Module):
         values = call.parameters(*_AXES, "SET_HOMED", "CLEAR_HOMED")
         limit = 100_000.0
         x, y, z = (
-            _number(call, values, axis, -limit, limit) if axis in values else at
+            bounded(call.command, values, axis, at, low=-limit, high=limit)
             for axis, at in zip(_AXES, call.position[:3], strict=True)
         )
         known = _letters(call, values, "SET_HOMED", _AXES)
@@ -93,21 +93,6 @@ class ForceMove(Module):
             return done
 
         return AtStandstill(take, done)
-
-
-def _number(call: Call, values: dict[str, str], key: str, low: float, high: float) -> float:
-    try:
-        value = float(values[key])
-    except KeyError:
-        raise WordError(f"{call.command.name} lacks {key}=…") from None
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise WordError(
-            f"{key} of {call.command.name} is {quoted(values[key])}; it must be a number from {low:g} to"
-            f" {high:g}"
-        )
-    return value
 
 
 def _letters(call: Call, values: dict[str, str], key: str, default: str) -> str:

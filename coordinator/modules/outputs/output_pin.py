@@ -6,10 +6,10 @@ from typing import ClassVar, Final
 from coordinator.config.options import BoolOption, FloatOption, ListOption, SectionSpec
 from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import Call, Reading, Synchronized
+from coordinator.gcode.parameters import one, value
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
-from coordinator.modules.words import one, parameters, value
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
@@ -63,7 +63,7 @@ class OutputPins(Module):
         )
 
     def _set(self, call: Call) -> Reading:
-        given = parameters(call.command, ("PIN", "VALUE"))
+        given = call.parameters("PIN", "VALUE")
         pin = self.by_name[one(call.command, given, "PIN", self.by_name)]
         wanted = value(call.command, given, "VALUE")
         if not pin.allows(wanted):

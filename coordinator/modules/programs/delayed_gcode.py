@@ -5,11 +5,10 @@ from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
 from coordinator.gcode.commands import Call, Immediate, Reading
-from coordinator.gcode.parser import Command, WordError, quoted
+from coordinator.gcode.parameters import bounded, needed, one
+from coordinator.gcode.parser import Command
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
-from coordinator.modules.words import bounded, needed, parameters
-from coordinator.support.quoting import nearest
 from coordinator.support.values import Value
 
 GCODE = GCodeOption(name="gcode", help="What is done: g-code, with Jinja2 between { and {% %}")
@@ -97,19 +96,14 @@ class DelayedGCodes(Module):
         self._all = {found.id: found for found in modules.of(DelayedGCode)}
 
     def _named(self, command: Command, values: Mapping[str, str]) -> DelayedGCode:
-        name = needed(command, values, "ID")
-        found = self._all.get(name)
-        if found is None:
-            hint = nearest(name, self._all) or f"; there is {', '.join(self._all)}"
-            raise WordError(f"{command.name} names the delayed g-code {quoted(name)}, of which none{hint}")
-        return found
+        return self._all[one(command, values, "ID", self._all)]
 
     def _update(self, call: Call) -> Reading:
-        values = parameters(call.command, ("ID", "DURATION"))
+        values = call.parameters("ID", "DURATION")
         found = self._named(call.command, values)
         needed(call.command, values, "DURATION")
         duration_s = bounded(call.command, values, "DURATION", 0.0, low=0.0, high=DURATION_MAX_S)
         return Immediate(act=lambda: found.wait_from_program(duration_s))
 
     def _run(self, call: Call) -> Reading:
-        return self._named(call.command, parameters(call.command, ("ID",))).template.lines(call, {})
+        return self._named(call.command, call.parameters("ID")).template.lines(call, {})

@@ -11,11 +11,11 @@ from typing import Final
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import Call, Immediate, ProgramContext, Reading, ToProgram
+from coordinator.gcode.parameters import flag, needed
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import flag, needed, parameters
 from coordinator.motion.planner.planner import FeedStatus, Planner
-from coordinator.support.quoting import nearest
+from coordinator.support.quoting import nearest_or_all
 from coordinator.support.values import Value
 
 OBJECTS_MAX: Final = 1000
@@ -90,7 +90,7 @@ class ExcludeObject(Module):
     # ---- What a program tells ----
 
     def _define(self, call: Call) -> Reading:
-        values = parameters(call.command, ("NAME", "CENTER", "POLYGON", "RESET", "JSON"))
+        values = call.parameters("NAME", "CENTER", "POLYGON", "RESET", "JSON")
         if flag(call.command, values, "RESET"):
             return ToProgram(self._reset)
         if "NAME" not in values:
@@ -114,7 +114,7 @@ class ExcludeObject(Module):
         return done
 
     def _start(self, call: Call) -> Reading:
-        name = needed(call.command, parameters(call.command, ("NAME",)), "NAME").upper()
+        name = needed(call.command, call.parameters("NAME"), "NAME").upper()
 
         def act(job: ProgramContext) -> bool:
             if name not in self._objects:
@@ -128,7 +128,7 @@ class ExcludeObject(Module):
         return ToProgram(act)
 
     def _end(self, call: Call) -> Reading:
-        parameters(call.command, ("NAME",))
+        call.parameters("NAME")
 
         def act(job: ProgramContext) -> bool:
             done = self._make_moves(job)
@@ -142,7 +142,7 @@ class ExcludeObject(Module):
 
     def _exclude(self, call: Call) -> Reading:
         command = call.command
-        values = parameters(command, ("NAME", "CURRENT", "RESET"))
+        values = call.parameters("NAME", "CURRENT", "RESET")
         name = values.get("NAME", "").upper()
         if flag(command, values, "RESET"):
             return ToProgram(lambda job: self._take_back(job, name))
@@ -153,7 +153,7 @@ class ExcludeObject(Module):
         if not name:
             return Immediate((f"Excluded objects: {' '.join(sorted(self._excluded)) or 'none'}",))
         if name not in self._objects:
-            hint = nearest(name, self._objects) or f"; there is {', '.join(self._objects) or 'none'}"
+            hint = nearest_or_all(name, self._objects)
             raise WordError(f"EXCLUDE_OBJECT names {quoted(name)}, which is no object of this program{hint}")
 
         def act(job: ProgramContext) -> bool:

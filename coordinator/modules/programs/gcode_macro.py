@@ -8,11 +8,11 @@ from typing import Any, Final
 from coordinator.config.errors import ConfigError, Place
 from coordinator.config.options import GCodeOption, Option, SectionSpec, TextOption
 from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
+from coordinator.gcode.parameters import needed, one
 from coordinator.gcode.parser import Command, WordError, parse, quoted
 from coordinator.gcode.templates.templates import Asked, Template, TemplateError, line_of
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.printer_status import PrinterStatus
-from coordinator.support.quoting import nearest
 from coordinator.support.values import Value
 
 GCODE = GCodeOption(name="gcode", help="What is done: g-code, with Jinja2 between { } and {% %}")
@@ -159,14 +159,8 @@ class Variables(Module):
     def _set(self, call: Call) -> Reading:
         words = call.command.parameters()
         for key in ("MACRO", "VARIABLE", "VALUE"):
-            if key not in words:
-                raise WordError(f"SET_GCODE_VARIABLE has no {key}; add {key}=...")
-        macro = self._macros.get(words["MACRO"].upper())
-        if macro is None:
-            hint = nearest(words["MACRO"], self._macros)
-            raise WordError(
-                f"SET_GCODE_VARIABLE names the macro {quoted(words['MACRO'])}, of which none{hint}"
-            )
+            needed(call.command, words, key)
+        macro = self._macros[one(call.command, words, "MACRO", self._macros)]
         name = words["VARIABLE"].lower()
         if name not in macro.variables:
             has = ", ".join(macro.variables) or "none"

@@ -8,9 +8,9 @@ from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
 from coordinator.gcode.commands import Call, Immediate, Lines, Reading
+from coordinator.gcode.parameters import bounded
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
-from coordinator.modules.words import bounded, parameters
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
@@ -115,7 +115,7 @@ class IdleTimeout(Module):
         return Lines("\n".join(self._default))
 
     def _set(self, call: Call) -> Reading:
-        values = parameters(call.command, ("TIMEOUT",))
+        values = call.parameters("TIMEOUT")
         timeout_s = bounded(call.command, values, "TIMEOUT", self._configured_s, low=0.001, high=1e6)
 
         def act() -> None:

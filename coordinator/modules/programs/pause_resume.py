@@ -11,9 +11,9 @@ from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.builtins.state import save_state
 from coordinator.gcode.commands import Call, ProgramContext, Reading, ToProgram
 from coordinator.gcode.events import Reply
+from coordinator.gcode.parameters import bounded
 from coordinator.modules.base import Build, Module
 from coordinator.modules.status.print_stats import PrintStats
-from coordinator.modules.words import bounded, parameters
 from coordinator.support.values import Value
 
 VELOCITY = FloatOption(
@@ -61,7 +61,7 @@ class PauseResume(Module):
         self._paused = False
 
     def _pause(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(job: ProgramContext) -> bool:
             if self._paused and (job.prints is None or job.prints.paused):
@@ -78,7 +78,7 @@ class PauseResume(Module):
         return ToProgram(act)
 
     def _resume(self, call: Call) -> Reading:
-        values = parameters(call.command, ("VELOCITY",))
+        values = call.parameters("VELOCITY")
         speed = bounded(call.command, values, "VELOCITY", self._velocity_mm_s, low=0.001, high=10_000.0)
 
         def act(job: ProgramContext) -> bool:
@@ -96,7 +96,7 @@ class PauseResume(Module):
         return ToProgram(act)
 
     def _cancel(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(job: ProgramContext) -> bool:
             self._paused = False
@@ -107,7 +107,7 @@ class PauseResume(Module):
         return ToProgram(act)
 
     def _clear(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(_job: ProgramContext) -> bool:
             self._paused = False

@@ -13,10 +13,10 @@ from typing import Any, Final
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec, TextOption
 from coordinator.gcode.commands import Call, Immediate, Reading
+from coordinator.gcode.parameters import needed
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
-from coordinator.modules.words import needed, parameters
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.atomic_file import atomic_write
 from coordinator.support.quoting import shown_path
@@ -68,7 +68,7 @@ class SaveVariables(Module):
         return {"variables": {name: plain(value) for name, value in dict(self._variables).items()}}
 
     def _save(self, call: Call) -> Reading:
-        values = parameters(call.command, ("VARIABLE", "VALUE"))
+        values = call.parameters("VARIABLE", "VALUE")
         name, text = (needed(call.command, values, key) for key in ("VARIABLE", "VALUE"))
         if not name.isidentifier() or not name.isascii():
             raise WordError(f"VARIABLE of SAVE_VARIABLE is {quoted(name)}; write letters, digits and _")

@@ -13,12 +13,12 @@ from coordinator.gcode.commands import (
     Recovering,
     ToProgram,
 )
+from coordinator.gcode.parameters import bounded, flag, needed
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
-from coordinator.modules.words import bounded, flag, needed, parameters
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
@@ -77,7 +77,7 @@ class VirtualSdcard(Module):
         }
 
     def _print(self, call: Call) -> Reading:
-        values = parameters(call.command, ("FILENAME",))
+        values = call.parameters("FILENAME")
         name = needed(call.command, values, "FILENAME").lstrip("/")
         return ToProgram(lambda job: self._begin(job, name))
 
@@ -99,7 +99,7 @@ class VirtualSdcard(Module):
             raise WordError(str(error)) from None
 
     def _reset(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(job: ProgramContext) -> bool:
             if job.prints is not None and job.prints.job_is_active:
@@ -167,7 +167,7 @@ class VirtualSdcard(Module):
         )
 
     def _recover(self, call: Call) -> Reading:
-        values = parameters(call.command, ("LINE", "HOME", "Z"))
+        values = call.parameters("LINE", "HOME", "Z")
         line = bounded(call.command, values, "LINE", None, low=1, high=1e9)
         z_mm = bounded(call.command, values, "Z", None, low=-1e6, high=1e6)
         how = Recovering(None if line is None else int(line), flag(call.command, values, "HOME"), z_mm)

@@ -6,11 +6,11 @@ from typing import Final
 from coordinator.config.options import BoolOption, FloatOption, GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import Call, Immediate, Reading
+from coordinator.gcode.parameters import flag, needed, one
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
-from coordinator.modules.words import flag, needed, one, parameters
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.button import Button
@@ -131,7 +131,7 @@ class FilamentSensors(Module):
         self._all = {found.id: found for found in modules.of(FilamentSwitchSensor)}
 
     def _sensor(self, call: Call, *others: str) -> tuple[FilamentSwitchSensor, Mapping[str, str]]:
-        given = parameters(call.command, ("SENSOR", *others))
+        given = call.parameters("SENSOR", *others)
         return self._all[one(call.command, given, "SENSOR", self._all)], given
 
     def _query(self, call: Call) -> Reading:

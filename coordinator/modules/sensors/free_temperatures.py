@@ -26,7 +26,7 @@ from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest, shown
+from coordinator.support.quoting import nearest_or_all, shown
 from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.node import Node
@@ -50,7 +50,7 @@ class ChipTemperature(TemperatureSource):
         self._node = build.get(SENSOR_MCU)
         names = [node.name for node in build.machine.nodes]
         if self._node not in names:
-            hint = nearest(self._node, names) or f"; there is {', '.join(names)}"
+            hint = nearest_or_all(self._node, names)
             raise build.reader.bad(SENSOR_MCU, f"but there is no node {shown(self._node)}{hint}")
         self._own = _own_line(build)
         self._chip: ChipSensor | None = None
@@ -192,7 +192,7 @@ class CombinedTemperature(TemperatureSource):
             source = known.get(name)
             if source is None or source is self:
                 others = [other for other in known if known[other] is not self]
-                hint = nearest(name, others) or f"; there is {', '.join(others) or 'none'}"
+                hint = nearest_or_all(name, others)
                 why = "this section itself" if source is self else f"{shown(name)}, which does not exist"
                 raise ConfigError(
                     self._reader.place_of(SENSOR_LIST), f"'sensor_list' of [{self.name}] names {why}{hint}"

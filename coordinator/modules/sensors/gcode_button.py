@@ -6,10 +6,10 @@ from typing import Final
 from coordinator.config.options import GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import Call, Immediate, Reading
+from coordinator.gcode.parameters import flag, one
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
-from coordinator.modules.words import flag, one, parameters
 from coordinator.support.values import Value
 from nodes.devices.button import Button
 
@@ -73,11 +73,11 @@ class GCodeButtons(Module):
         self._all = {found.id: found for found in modules.of(GCodeButton)}
 
     def _query(self, call: Call) -> Reading:
-        name = one(call.command, parameters(call.command, ("BUTTON",)), "BUTTON", self._all)
+        name = one(call.command, call.parameters("BUTTON"), "BUTTON", self._all)
         return Immediate((f"{name}: {self._all[name].status()['state']}",))
 
     def _run(self, call: Call) -> Reading:
-        given = parameters(call.command, ("BUTTON", "PRESSED"))
+        given = call.parameters("BUTTON", "PRESSED")
         found = self._all[one(call.command, given, "BUTTON", self._all)]
         pressed = flag(call.command, given, "PRESSED")
         return (found.press if pressed else found.release).lines(call, {})

@@ -7,7 +7,6 @@ from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parser import WordError, number
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import parameters
 from coordinator.support.values import Value
 
 TEXT_MAX: Final = 500
@@ -43,7 +42,7 @@ class DisplayStatus(Module):
         return self._message_is(call.command.text.strip())
 
     def _set(self, call: Call) -> Reading:
-        return self._message_is(parameters(call.command, ("MSG",)).get("MSG", ""))
+        return self._message_is(call.parameters("MSG").get("MSG", ""))
 
     def _message_is(self, text: str) -> Reading:
         def act() -> None:

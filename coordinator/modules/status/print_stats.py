@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from coordinator.gcode.commands import Call, Immediate, Reading
+from coordinator.gcode.parameters import bounded
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import bounded, parameters
 from coordinator.support.values import Value
 
 _LAYERS_MAX: Final = 1e6
@@ -59,7 +59,7 @@ class PrintStats(Module):
         return {**self.told, "info": layers}
 
     def _set(self, call: Call) -> Reading:
-        values = parameters(call.command, ("TOTAL_LAYER", "CURRENT_LAYER"))
+        values = call.parameters("TOTAL_LAYER", "CURRENT_LAYER")
         total = bounded(call.command, values, "TOTAL_LAYER", None, low=0, high=_LAYERS_MAX)
         current = bounded(call.command, values, "CURRENT_LAYER", None, low=0, high=_LAYERS_MAX)
 

@@ -5,7 +5,6 @@ from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.gcode.reply_kinds import kind_of_line
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import parameters
 
 PREFIXES = {"echo": "echo:", "command": "//", "error": "!!"}
 TYPE = ChoiceOption(
@@ -35,7 +34,7 @@ class Respond(Module):
         return _line(f"{self._prefix} {call.command.text.strip()}")
 
     def _respond(self, call: Call) -> Reading:
-        values = parameters(call.command, ("TYPE", "PREFIX", "MSG"))
+        values = call.parameters("TYPE", "PREFIX", "MSG")
         prefix = self._prefix
         if "TYPE" in values:
             kind = values["TYPE"].lower()
