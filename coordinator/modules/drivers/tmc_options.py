@@ -30,26 +30,16 @@ UART_ADDRESS: Final = IntOption(
 ONLY_UART_ADDRESS: Final = IntOption(
     name="uart_address", help="this driver has no other address", default=0, minimum=0, maximum=0
 )
-RUN_CURRENT: Final = FloatOption(
-    name="run_current",
-    help="current of a motor that moves, RMS",
-    unit="A",
-    above=0,
-    maximum=MAX_CURRENT_A,
-)
-HOLD_CURRENT: Final = FloatOption(
-    name="hold_current",
-    help="current of a motor that stands, RMS; by default run_current",
-    unit="A",
-    above=0,
-    maximum=MAX_CURRENT_A,
-)
-HOME_CURRENT: Final = FloatOption(
-    name="home_current",
-    help="current while it feels for the end of its axis, RMS; by default run_current",
-    unit="A",
-    above=0,
-    maximum=MAX_CURRENT_A,
+
+
+def _current(name: str, text: str) -> FloatOption:
+    return FloatOption(name=name, help=text, unit="A", above=0, maximum=MAX_CURRENT_A)
+
+
+RUN_CURRENT: Final = _current("run_current", "current of a motor that moves, RMS")
+HOLD_CURRENT: Final = _current("hold_current", "current of a motor that stands, RMS; by default run_current")
+HOME_CURRENT: Final = _current(
+    "home_current", "current while it feels for the end of its axis, RMS; by default run_current"
 )
 SENSE_RESISTOR: Final = FloatOption(
     name="sense_resistor",

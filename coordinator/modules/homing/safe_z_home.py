@@ -5,7 +5,7 @@ from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
-from coordinator.config.sections.bounds import MAX_SPEED
+from coordinator.config.sections.bounds import speed_option
 from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
@@ -39,9 +39,7 @@ class PlaceOption(Option[tuple[float, float]]):
 
 
 PLACE: Final = PlaceOption(name="home_xy_position", help="where the head is when Z is homed", unit="mm")
-SPEED: Final = FloatOption(
-    name="speed", help="of the way there", default=50.0, unit="mm/s", above=0, maximum=MAX_SPEED
-)
+SPEED: Final = speed_option("speed", "of the way there", 50.0)
 Z_HOP: Final = FloatOption(
     name="z_hop",
     help="how far the head is lifted before any axis is homed, and its height afterwards; 0: not at all",
@@ -50,9 +48,7 @@ Z_HOP: Final = FloatOption(
     minimum=0,
     maximum=HOP_MAX_MM,
 )
-Z_HOP_SPEED: Final = FloatOption(
-    name="z_hop_speed", help="of the lift", default=15.0, unit="mm/s", above=0, maximum=MAX_SPEED
-)
+Z_HOP_SPEED: Final = speed_option("z_hop_speed", "of the lift", 15.0)
 BACK: Final = BoolOption(
     name="move_to_previous",
     help="whether X and Y go back to where they were before Z was homed",
