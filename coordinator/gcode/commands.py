@@ -245,10 +245,6 @@ class ProgramContext(ABC):
         """Report WHAT with a remark, once per program."""
 
     @abstractmethod
-    def record(self, command: Command) -> None:
-        """Count COMMAND; only its last parameters are kept, so memory stays flat."""
-
-    @abstractmethod
     def refuse_skipping(self, command: Command, why: str) -> None:
         """Raise WordError for a COMMAND that a job must not go without; a plan only reports it.
 

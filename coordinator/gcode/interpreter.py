@@ -58,16 +58,6 @@ MAX_PLACES = 4
 
 
 @dataclass(slots=True)
-class Recorded:
-    """Commands of one name that wait for a module which does not exist yet."""
-
-    count: int
-    first_line: int
-    last_line: int
-    last_text: str
-
-
-@dataclass(slots=True)
 class _Inner:
     """The lines that take a command's place; read one by one, they count as the line of that command."""
 
@@ -125,8 +115,6 @@ class Job(ProgramContext):
         self.strict = strict
         """Whether a line that moves, heats or levels and that nothing acts on is an error; else a notice."""
         self._breaks = False
-        self.recorded: dict[str, Recorded] = {}
-        """By command name."""
         self._events: deque[Event] = deque()
         self._inner: list[_Inner] = []
         self._resting: StandstillAction | None = None
@@ -419,13 +407,6 @@ class Job(ProgramContext):
         if len(self._told) > MAX_NOTICES:
             text = f"{self.program.name}:{self.line}: more than {MAX_NOTICES} notices: no more are shown"
         self._events.append(Notice(self.line, text))
-
-    def record(self, command: Command) -> None:
-        """Count COMMAND; only its last parameters are kept, so memory stays flat."""
-        seen = self.recorded.setdefault(command.name, Recorded(0, self.line, self.line, ""))
-        seen.count += 1
-        seen.last_line = self.line
-        seen.last_text = command.text
 
     def emit(self, event: Event) -> None:
         """Tell EVENT with the next ``step``."""

@@ -12,7 +12,6 @@ OBSERVER_SPEED · k: fast against the sensor's lag, yet not so fast that noise i
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -201,9 +200,3 @@ class Mpc:
     def unexplained_w(self) -> float:
         """Heat that the model does not explain, W."""
         return 0.0 if self._estimate is None else self._estimate.unexplained_w
-
-
-def fan_speeds(transfers: Sequence[float]) -> list[float]:
-    """Return the fan speeds that a list of losses stands for."""
-    count = len(transfers)
-    return [index / (count - 1) for index in range(count)] if count > 1 else [0.0] * count

@@ -186,9 +186,8 @@ def _emergency(job: ProgramContext, _command: Command) -> bool:
 
 
 def _without_module(what: str) -> Handler:
-    def handle(job: ProgramContext, command: Command) -> bool:
-        job.record(command)
-        job.notice(what, "accepted and recorded, but without effect: no module acts on them yet")
+    def handle(job: ProgramContext, _command: Command) -> bool:
+        job.notice(what, "accepted, but without effect: no section of the configuration is for them")
         return True
 
     return handle

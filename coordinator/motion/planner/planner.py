@@ -610,11 +610,6 @@ class Planner:
         """Moves planned before they were settled because the queue was full."""
         return int(self._core.moves_overflowed)
 
-    @property
-    def moves_queued(self) -> int:
-        """Moves that are not handed out yet."""
-        return int(self._core.tail - self._core.head)
-
 
 def ffi_memory(trapezoids: Any, count: int) -> Any:
     """Return the memory of COUNT trapezoids from a pointer to them; valid as long as they are."""
