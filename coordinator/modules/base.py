@@ -130,8 +130,8 @@ class Build:
         self.machine = machine
         """Nodes, steppers, rails, limits: what does not come from modules."""
         self.reader = SectionReader(section, spec, whole=whole)
-        self.devices: list[tuple[str, Device]] = []
-        """With the node of each."""
+        self.devices: list[tuple[str, Device, PinDescription | None]] = []
+        """With the node of each, and the pin that has to be checked there."""
         self.commands: list[GCodeCommand] = []
         self.replacements: list[tuple[GCodeCommand, str]] = []
         """Commands that may take another's name, and the name that one has then; empty: there is no other."""
@@ -190,9 +190,9 @@ class Build:
         """Report the user something about an option that is no mistake; SENTENCE goes on after its name."""
         self.notes.append(f"{self.reader.place_of(option)}: '{option.name}' of [{self.name}] {sentence}")
 
-    def add_device(self, node: str, device: Device) -> None:
-        """Have DEVICE on a node."""
-        self.devices.append((node, device))
+    def add_device(self, node: str, device: Device, pin: PinDescription | None = None) -> None:
+        """Add DEVICE to a node; if its firmware has no PIN, that is an error of the option that names it."""
+        self.devices.append((node, device, pin))
 
     def add_command(
         self, name: str, text: str, read: Callable[[Call], Reading], *, while_printing: bool = False

@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawSection
 from coordinator.config.model import MachineDescription, ModuleSection
-from coordinator.config.pins import PinRegistry
+from coordinator.config.pins import PinDescription, PinRegistry
 from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.gcode.absent_commands import ABSENT
 from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
@@ -135,7 +135,7 @@ class ModuleSet:
         self._machine = machine
         self._modules: list[Module] = []
         self._places: dict[Module, Place] = {}
-        self._devices: dict[str, list[Device]] = {}
+        self._devices: dict[str, list[tuple[Device, PinDescription | None]]] = {}
         self._commands: dict[str, GCodeCommand] = {}
         self._owners: dict[str, str] = {}
         self._set_ups: list[Callable[[Planner], None]] = []
@@ -207,8 +207,8 @@ class ModuleSet:
     def _add(self, module: Module, build: Build) -> None:
         self._modules.append(module)
         self._places[module] = build.place
-        for node, device in build.devices:
-            self._devices.setdefault(node, []).append(device)
+        for node, device, pin in build.devices:
+            self._devices.setdefault(node, []).append((device, pin))
         for command in build.commands:
             owner = self._owners.setdefault(command.name, build.name)
             if owner != build.name and command.name in self._commands:
@@ -356,14 +356,17 @@ class ModuleSet:
 
     def configure(self, config: NodeConfig) -> None:
         """Add all that is on a node to its CONFIG; raises CanductorError."""
-        for device in self._devices.get(config.name, ()):
+        known = config.dictionary.enumerations.get("pin")
+        for device, pin in self._devices.get(config.name, ()):
+            if pin is not None:
+                pin.number({} if known is None else known.values)  # raises ConfigError with file and line
             device.configure(config)
 
     # ---------------------------------------------------------------------------------------------- life
 
     def node_started(self, node: "Node") -> None:
         """Take note that NODE is ready, for the first time or again."""
-        for device in self._devices.get(node.name, ()):
+        for device, _ in self._devices.get(node.name, ()):
             device.started(node)
 
     async def connect(self, machine: Machine, say: Callable[[str], None]) -> None:

@@ -6,7 +6,7 @@ from typing import Any, Final
 from coordinator.config.options import BoolOption, FloatOption, IntOption, Option
 from coordinator.config.pins import PinOption
 from coordinator.modules.base import Build, Module
-from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
+from coordinator.modules.outputs.timing import AHEAD_S, pwm_cycle
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.counter import Counter
@@ -117,14 +117,14 @@ class FanUnit:
             invert=pin.invert,
             shutdown=stopped * self._max_power if hardware else stopped,
         )
-        add_pinned(build, self._output, pin)
+        build.add_device(pin.node, self._output, pin)
         build.add_device(pin.node, self)
         self._enable = self._enable_node = None
         enable = build.find_pin(ENABLE_PIN)
         if enable is not None:
             self._enable = DigitalOut(f"the power of [{build.name}]", pin=enable.name, invert=enable.invert)
             self._enable_node = enable.node
-            add_pinned(build, self._enable, enable)
+            build.add_device(enable.node, self._enable, enable)
         self._add_tachometer(build)
         self._live: ModuleContext | None = None
 
@@ -141,7 +141,7 @@ class FanUnit:
             self.rpm = frequency * 60 / pulses
 
         counter.on_frequency = counted
-        add_pinned(build, counter, tachometer)
+        build.add_device(tachometer.node, counter, tachometer)
 
     def configure(self, config: NodeConfig) -> None:
         """Do nothing: its parts are devices too."""

@@ -25,7 +25,7 @@ from coordinator.heat.verify import HeaterCheck, VerifyOptions, default_options
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.fans.fan_unit import FanModule
 from coordinator.modules.heaters.control import ControlSettings
-from coordinator.modules.pinned import AHEAD_S, add_pinned
+from coordinator.modules.outputs.timing import AHEAD_S
 from coordinator.modules.sensors.temperature_input import SensorModule, TemperatureInput
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
@@ -83,7 +83,7 @@ class Heater:
             # Counted from when a value takes effect, which is so long after it was sent.
             max_duration_s=build.get(MAX_DURATION) - AHEAD_S,
         )
-        add_pinned(build, self._output, pin)
+        build.add_device(pin.node, self._output, pin)
         self._find_fan = build.needed(COOLING_FAN, FanModule) if build.find(COOLING_FAN) else None
         ambient = build.find(AMBIENT_SENSOR)
         self._find_ambient = build.needed(AMBIENT_SENSOR, SensorModule) if ambient else None

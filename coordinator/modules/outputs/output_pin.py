@@ -9,7 +9,7 @@ from coordinator.gcode.commands import Call, Reading, Synchronized
 from coordinator.gcode.parameters import one, value
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
-from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
+from coordinator.modules.outputs.timing import AHEAD_S, pwm_cycle
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
@@ -111,7 +111,7 @@ class OutputPin(Module):
             self._output = DigitalOut(
                 what, pin=pin.name, invert=pin.invert, start=begin > 0, shutdown=stopped > 0
             )
-        add_pinned(build, self._output, pin)
+        build.add_device(pin.node, self._output, pin)
         build.add_device(pin.node, self)
         build.shared(OutputPins).by_name[build.instance] = self
 
@@ -187,4 +187,4 @@ class StaticDigitalOutput(Module):
         for pin in build.pins(PINS):
             on = not pin.invert
             output = DigitalOut(f"[{build.name}]", pin=pin.name, start=on, shutdown=on)
-            add_pinned(build, output, pin)
+            build.add_device(pin.node, output, pin)

@@ -8,7 +8,6 @@ from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parameters import flag, needed, one
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.runtime.module_context import ModuleContext
@@ -76,7 +75,7 @@ class FilamentSwitchSensor(Module):
         pin = build.pin(PIN)
         self.switch = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
         self.switch.on_change = self._changed
-        add_pinned(build, self.switch, pin)
+        build.add_device(pin.node, self.switch, pin)
         build.shared(FilamentSensors)
 
     def link(self, modules: Modules) -> None:

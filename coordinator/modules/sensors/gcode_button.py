@@ -8,7 +8,6 @@ from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parameters import flag, one
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.support.values import Value
 from nodes.devices.button import Button
@@ -35,7 +34,7 @@ class GCodeButton(Module):
         pin = build.pin(PIN)
         self._button = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
         self._button.on_change = self._changed
-        add_pinned(build, self._button, pin)
+        build.add_device(pin.node, self._button, pin)
         build.shared(GCodeButtons)
 
     def end(self, cause: str) -> None:  # noqa: ARG002

@@ -27,7 +27,6 @@ from coordinator.heat.resistors import SensorError
 from coordinator.heat.sensors import AmplifiedPullUp, PullUp, Sensor, ratio_range
 from coordinator.heat.thermocouples import AMPLIFIERS, amplifier
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.pinned import add_pinned
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.sensors.thermistor import KINDS, Circuit, CustomSensor
 from coordinator.runtime.module_context import ModuleContext
@@ -65,7 +64,7 @@ class TemperatureInput(TemperatureSource):
         self._sensor: Sensor | None = None
         self._analog = AnalogIn(build.name, pin=self._pin.name)
         self._analog.on_value = self._came
-        add_pinned(build, self._analog, self._pin)
+        build.add_device(self._pin.node, self._analog, self._pin)
 
     def link(self, modules: Modules) -> None:
         """Find out what the sensor is, and what its converter may read; raises ConfigError."""

@@ -15,8 +15,8 @@ from jinja2 import ChainableUndefined
 from coordinator.gcode.commands import Call
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.absent_status import absent_statuses
-from coordinator.modules.status.config_view import ConfigView
-from coordinator.modules.status.machine_view import Commands, machine_view
+from coordinator.modules.status.config_view import config_view
+from coordinator.modules.status.machine_view import machine_view
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.runtime.module_context import ModuleContext
 
@@ -81,12 +81,12 @@ class PrinterStatus(Module):
         return self._last
 
     def _every(self, modules: Modules) -> Shown:
-        told: dict[str, Mapping[str, object]] = {"gcode": Commands(modules), **machine_view(self._live)}
+        told: dict[str, Mapping[str, object]] = dict(machine_view(modules, self._live))
         # A section that has nothing to tell is there nevertheless: macros ask whether others are.
         told.update(absent_statuses(modules.config))
         told.update((name, {}) for name in modules.names(Module) if name in modules.config)
         told.update((name, self._for_macros(status)) for name, status in modules.status().items())
-        told["configfile"] = ConfigView(modules.config, modules.settings, told.get("configfile", {}))
+        told["configfile"] = config_view(modules.config, modules.settings, told.get("configfile", {}))
         return told
 
     def _for_macros(self, status: Mapping[str, object]) -> Mapping[str, object]:

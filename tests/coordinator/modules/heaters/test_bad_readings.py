@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.modules.heaters.heater import BAD_MEASUREMENTS
-from coordinator.modules.pinned import AHEAD_S
+from coordinator.modules.outputs.timing import AHEAD_S
 from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
 from coordinator.modules.sensors.temperature_source import BAD_IN_A_ROW
 from nodes.devices.analog_in import RANGE_CHECKS

@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.heat.mpc import Mpc
 from coordinator.modules.heaters.heater import LOOK_S, STALE_SPARE_S
-from coordinator.modules.pinned import AHEAD_S
+from coordinator.modules.outputs.timing import AHEAD_S
 from nodes.support.errors import CanductorError
 from tests.coordinator.modules.heaters.broken_sensor import Sensor
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine
