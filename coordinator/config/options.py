@@ -404,7 +404,7 @@ class SectionReader:
         return option.stand_in()
 
     def bad(self, option: Option[T], sentence: str) -> ConfigError:
-        """Return the error for a value; the sentence goes on after "option 'x' of [y] is 'z', "."""
+        """Return the error for a value; the sentence continues after "option 'x' of [y] is 'z', "."""
         raw = self.section.options.get(option.name)
         given = f" is {shown(raw.value)}," if raw else ""
         return ConfigError(
@@ -432,7 +432,7 @@ class SectionReader:
                 self.section.report(
                     ConfigError(
                         option.place,
-                        f"option '{option.name}' of [{self.name}] has no effect beside the others; remove it",
+                        f"option '{option.name}' of [{self.name}] has no effect with the others; remove it",
                     )
                 )
         return tuple(unread)

@@ -2,7 +2,7 @@
 
 1. *rest*: the heater is off until its temperature stands still: that is what is around it.
 2. *heat*: at full power to the target. Capacity and responsiveness are those whose model fits the rise best.
-3. *hold*: at the target, with the fan at each of its speeds in turn, the power that holds it tells the loss.
+3. *hold*: at the target, with the fan at each of its speeds in turn, the power that holds it gives the loss.
 4. With the losses known the rise is fitted once more.
 """
 

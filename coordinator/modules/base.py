@@ -1,4 +1,4 @@
-"""The seam between the machine and its modules.
+"""The interface between the machine and its modules.
 
 A section ``[heater_fan hotend]`` of the configuration becomes one object of a subclass of ``Module``:
 
@@ -36,13 +36,13 @@ __all__ = ["Build", "Device", "Module", "Modules"]
 
 
 class Device(Protocol):
-    """What a module has on a node: the host's side of one of its objects."""
+    """The host's side of an object on a node."""
 
     def configure(self, config: NodeConfig) -> None:
-        """Add it to what its node is configured as; raises NodeConfigError."""
+        """Add it to the configuration of its node; raises NodeConfigError."""
 
     def started(self, node: "Node") -> None:
-        """Its node is ready: at the start, and each time that it came back after it was lost."""
+        """Act on a node that is ready: at the start, and each time it comes back after it was lost."""
 
 
 class Module:
@@ -134,7 +134,7 @@ class Build:
         """With the node of each, and the pin that has to be checked there."""
         self.commands: list[GCodeCommand] = []
         self.replacements: list[tuple[GCodeCommand, str]] = []
-        """Commands that may take another's name, and the name that one has then; empty: there is no other."""
+        """Commands that may replace another one, and the new name of that one; empty: there is none."""
         self.set_ups: list[Callable[[Planner], None]] = []
         self.notes: list[str] = []
         self.unsupported = unsupported
@@ -187,7 +187,7 @@ class Build:
             raise NotSupported(self.place, f"it is for [{section}], which is not supported yet")
 
     def note(self, option: Option[Any], sentence: str) -> None:
-        """Report the user something about an option that is no mistake; SENTENCE goes on after its name."""
+        """Report something about an option that is no error; SENTENCE continues after the option's name."""
         self.notes.append(f"{self.reader.place_of(option)}: '{option.name}' of [{self.name}] {sentence}")
 
     def add_device(self, node: str, device: Device, pin: PinDescription | None = None) -> None:
@@ -201,11 +201,11 @@ class Build:
         self.commands.append(GCodeCommand(name, text, read, while_printing=while_printing))
 
     def replace_command(self, command: GCodeCommand, rename: str = "") -> None:
-        """Have programs know COMMAND; one that had its name before is called RENAME then."""
+        """Add COMMAND to those of programs; one that had its name before is renamed to RENAME."""
         self.replacements.append((command, rename))
 
     def set_up_programs(self, call: "Callable[[Planner], None]") -> None:
-        """Have CALL called for every program that begins, in the reader's thread."""
+        """Call CALL for every program that begins, in the reader's thread."""
         self.set_ups.append(call)
 
     def shared(self, kind: type[M]) -> M:

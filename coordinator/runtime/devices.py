@@ -91,7 +91,7 @@ class MachineDevices:
         return rail.homing.endstop_pin.node
 
     def _spread_shutdown(self, config: NodeConfig) -> None:
-        """Have a node that must not fail stop its whole bus when it shuts down, past the host."""
+        """Make a node with policy fatal stop its whole bus when it shuts down, without the host."""
         described = next(n for n in self.description.nodes if n.name == config.name)
         knows = config.dictionary.int_constant(KNOWS_BUS_STOP, 0)
         on_can = isinstance(described.connection, CanConnection)

@@ -16,7 +16,7 @@ def shown(text: str) -> str:
 
 
 def shown_path(path: str) -> str:
-    """Quote a path; of a long one the end is what tells."""
+    """Quote a path; of a long one the end is shown."""
     line = "".join(c if c.isprintable() else "?" for c in path)
     return f"'{line}'" if len(line) <= _SHOWN_PATH_CHARS else f"'…{line[-_SHOWN_PATH_CHARS:]}'"
 

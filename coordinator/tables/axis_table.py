@@ -155,11 +155,11 @@ def notes(table: AxisTable, low: float | None, high: float | None) -> list[str]:
             f"from {low:g} to {high:g} {table.unit}; check the unit and the axis"
         )
     if first > low or last < high:
-        told = (
+        note = (
             f"axis {table.axis} travels from {low:g} to {high:g} {table.unit}, the table covers {first:g} to "
             f"{last:g}; beyond it the corrections at its ends hold"
         )
-        return [told]
+        return [note]
     return []
 
 

@@ -158,7 +158,7 @@ def _columns(path: Path, line: int, cells: list[str]) -> dict[str, tuple[int, st
 
 
 def _checked(path: Path, axis: str, kind: Unit, points: list[_Point]) -> AxisTable:
-    """Return the table; what is wrong with a point is told with its line."""
+    """Return the table; errors of a point name its line."""
     if len(points) not in POINTS:
         raise TableError(f"{path}: {len(points)} points; a table has {POINTS[0]} to {POINTS[-1]}")
     before = None

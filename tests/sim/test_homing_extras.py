@@ -133,7 +133,7 @@ def test_two_that_stand_in_for_g28_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "printer.cfg"
     path.write_text(SWITCHES_CFG + SAFE + "[homing_override]\ngcode:\n  G28 X\n")
     (problem,) = check_config(str(path))
-    assert "both say what G28 does; remove one" in str(problem)
+    assert "both replace G28; remove one" in str(problem)
 
 
 @pytest.mark.parametrize(

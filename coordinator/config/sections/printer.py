@@ -41,7 +41,7 @@ SQUARE_CORNER_VELOCITY = FloatOption(
 )
 MINIMUM_CRUISE_RATIO = FloatOption(
     name="minimum_cruise_ratio",
-    help="share of a short move that is to be cruise, which limits zig-zag",
+    help="smallest share of a short move that is cruise, which limits zig-zag",
     default=0.5,
     minimum=0,
     below=1,
@@ -117,7 +117,7 @@ def _cruise_ratio(reader: SectionReader, max_accel: float) -> float:
     if reader.has(MINIMUM_CRUISE_RATIO):
         return reader.get(
             MINIMUM_CRUISE_RATIO
-        )  # then an older max_accel_to_decel beside it has no effect: finish tells
+        )  # then an older max_accel_to_decel has no effect: finish reports it
     max_accel_to_decel = reader.find(MAX_ACCEL_TO_DECEL)
     if max_accel_to_decel is None:
         return reader.get(MINIMUM_CRUISE_RATIO)

@@ -17,7 +17,7 @@ class _UpperEnd(FloatOption):
     """The end of a range."""
 
     def stand_in(self) -> float:
-        """Return the furthest: no place is told to lie outside of a range that nobody gave."""
+        """Return the furthest: positions are not checked against a range that is missing."""
         return MAX_POSITION
 
 

@@ -1,4 +1,4 @@
-"""``endstop_pin: tmc2209_stepper_x:virtual_endstop``: an endstop that a stepper's driver feels.
+"""``endstop_pin: tmc2209_stepper_x:virtual_endstop``: sensorless homing by a stepper's driver.
 
 The driver raises its DIAG, so the endstop's pin is ``diag_pin`` of the driver's section, on whatever node.
 """
@@ -11,7 +11,7 @@ from coordinator.config.pins import PinName, PinOption, PinRegistry
 from coordinator.support.quoting import nearest, shown
 
 STALL_KINDS: Final = ("tmc2209",)
-"""First words of the sections of drivers that can feel the end of an axis."""
+"""First words of the sections of drivers that can detect the end of an axis."""
 NUMB_KINDS: Final = ("tmc2208",)
 """Of those that cannot."""
 NAME: Final = "virtual_endstop"
@@ -19,7 +19,7 @@ _DIAG: Final = PinOption(name="diag_pin", help="", pullable=True)
 
 
 def note_diag_pins(config: ConfigFile, pins: PinRegistry) -> None:
-    """Have PINS know the diag_pin of every driver's section that CONFIG has."""
+    """Register the diag_pin of every driver's section of CONFIG in PINS."""
     for section in config.sections.values():
         if section.kind not in STALL_KINDS:
             continue
@@ -27,7 +27,7 @@ def note_diag_pins(config: ConfigFile, pins: PinRegistry) -> None:
         try:
             found = None if given is None else _DIAG.parse(given.value)
         except BadValue:
-            found = None  # its own section tells
+            found = None  # reported for its own section
         pins.diag_pins[f"{section.kind}_{section.instance}"] = found
 
 
@@ -40,7 +40,7 @@ def find_diag_pin(
     """
     kind, _, stepper = pin.node.partition("_")
     if kind in NUMB_KINDS:
-        raise reader.bad(option, f"but a {kind.upper()} cannot feel the end of an axis; use a switch")
+        raise reader.bad(option, f"but a {kind.upper()} cannot detect the end of an axis; use a switch")
     if kind not in STALL_KINDS:
         return None
     section = f"[{kind} {stepper}]"

@@ -172,7 +172,7 @@ def _wait_for_moves(job: ProgramContext, _command: Command) -> bool:
     return True
 
 
-def _tell_position(job: ProgramContext, _command: Command) -> bool:
+def _report_position(job: ProgramContext, _command: Command) -> bool:
     position = zip(AXIS_LETTERS, job.planner.gcode_position, strict=True)
     job.emit(
         Reply(job.line, " ".join(f"{letter}:{value:.3f}" for letter, value in position), ReplyKind.PLAIN)
@@ -224,14 +224,14 @@ def _arc(job: ProgramContext, command: Command) -> bool:
 
 
 _HEATS = ("M104", "M109", "M140", "M190")
-_told_heat = _without_module("heater and fan commands")
+_without_heater = _without_module("heater and fan commands")
 
 
 def _heat(job: ProgramContext, command: Command) -> bool:
     """Accept what is for a heater or fan that the machine does not have, not for one that does not act."""
     why = job.vocabulary.unsupported.get(command.name)
     if why is None:
-        return _told_heat(job, command)
+        return _without_heater(job, command)
     words = command.words()
     asks = [letter for letter in "SR" if letter in words and number(command.name, words, letter) > 0]
     if command.name in _HEATS and asks:
@@ -271,7 +271,7 @@ HANDLERS: Mapping[str, Handler] = {
     "M83": _set("relative_extrusion", True),
     **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
     "M112": _emergency,
-    "M114": _tell_position,
+    "M114": _report_position,
     "M201": _limit_axes("accel"),
     "M203": _limit_axes("velocity"),
     "M204": _set_accel,

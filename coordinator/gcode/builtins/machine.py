@@ -34,7 +34,7 @@ def come_to_standstill(job: ProgramContext, settle_s: float = 0.0) -> bool:
 
 
 def begin(job: ProgramContext) -> None:
-    """Let JOB's planner begin as its machine's state says."""
+    """Set JOB's planner up for the state of its machine."""
     if job.machine.active is not None:
         _use_extruder(job, job.machine.active)
     _keep_apart(job)
@@ -161,7 +161,7 @@ def _activate(job: ProgramContext, extruder: Extruder) -> bool:
 
 
 def _change_places(job: ProgramContext, before: Extruder | None, after: Extruder) -> None:
-    """Let E read where AFTER was left; the machine's E axis goes on from where BEFORE has brought it."""
+    """Make E read the last position of AFTER; the machine's E axis continues from that of BEFORE."""
     planner = job.planner
     if before is not None:
         before.place_mm = planner.gcode_position[3] * planner.unit_mm
@@ -205,7 +205,7 @@ def set_input_shaper(job: ProgramContext, command: Command) -> bool:
     before = {axis: job.machine.shapers.get(axis, Shaper()) for axis in SHAPER_AXES}
     after = {axis: _shaper(command, values, axis, shaper) for axis, shaper in before.items()}
     if not values:
-        job.emit(Reply(job.line, " ".join(_told(axis, shaper) for axis, shaper in after.items())))
+        job.emit(Reply(job.line, " ".join(_shown(axis, shaper) for axis, shaper in after.items())))
         return True
     # An axis that is not shaped stays so whatever its kind would be.
     changed = [a for a in SHAPER_AXES if after[a] != before[a] and (before[a].width_s or after[a].width_s)]
@@ -236,7 +236,7 @@ def _shaper(command: Command, values: Mapping[str, str], axis: str, before: Shap
     )
 
 
-def _told(axis: str, shaper: Shaper) -> str:
+def _shown(axis: str, shaper: Shaper) -> str:
     return (
         f"SHAPER_TYPE_{axis}={shaper.kind} SHAPER_FREQ_{axis}={shaper.frequency_hz:g} "
         f"DAMPING_RATIO_{axis}={shaper.damping_ratio:g}"

@@ -40,7 +40,7 @@ def go(job: ProgramContext, target: list[float], speed_mm_s: float) -> bool:
 def set_gcode_offset(job: ProgramContext, command: Command) -> bool:
     """X Y Z E: the offset; X_ADJUST ...: by how much it changes; MOVE=1: go along at once.
 
-    Beside a job, MOVE makes the job's next move also make up for the change: it does not stop for it.
+    While a job prints, MOVE adds the change to the job's next move: the job does not stop for it.
     """
     adjust = [f"{axis}_ADJUST" for axis in AXIS_LETTERS]
     values = command.only_parameters((*AXIS_LETTERS, *adjust, "MOVE", "MOVE_SPEED"))
@@ -68,7 +68,7 @@ def set_gcode_offset(job: ProgramContext, command: Command) -> bool:
 
 
 def _check_reach(job: ProgramContext, change: Mapping[str, float]) -> None:
-    """Refuse an offset that would take the very next move out of the machine; the job goes on without it."""
+    """Refuse an offset that would take the next move out of the machine; the job continues without it."""
     limits = job.planner.limits
     for axis, at, low, high in zip(
         "XYZ", job.planner.toolhead_position, limits.position_min, limits.position_max, strict=False
@@ -85,7 +85,7 @@ def _check_reach(job: ProgramContext, change: Mapping[str, float]) -> None:
 
 
 def save_gcode_state(job: ProgramContext, command: Command) -> bool:
-    """NAME: keep modes, speed, factors, origin, offset and position."""
+    """NAME: save modes, speed, factors, origin, offset and position."""
     name = command.only_parameters(("NAME",)).get("NAME", DEFAULT_STATE)
     save_state(job, name)
     return True
@@ -116,7 +116,7 @@ def present_state(planner: Planner) -> SavedState:
 
 
 def restore_gcode_state(job: ProgramContext, command: Command) -> bool:
-    """NAME: let all that be as it was; MOVE=1: also go back to where X Y Z were."""
+    """NAME: restore all that; MOVE=1: also move back to where X Y Z were."""
     values = command.only_parameters(("NAME", "MOVE", "MOVE_SPEED"))
     name = values.get("NAME", DEFAULT_STATE)
     saved = job.machine.saved.get(name)
@@ -128,7 +128,7 @@ def restore_gcode_state(job: ProgramContext, command: Command) -> bool:
 
 
 def restore_state(job: ProgramContext, saved: SavedState, move_mm_s: float | None) -> bool:
-    """Let all be as it was when SAVED was; MOVE_MM_S: also go back at this speed.
+    """Restore SAVED; MOVE_MM_S: also move back at this speed.
 
     E reads as it did, wherever the filament is meanwhile. False: the planner has to be emptied first.
     """
@@ -150,9 +150,9 @@ def restore_state(job: ProgramContext, saved: SavedState, move_mm_s: float | Non
 def come_back(
     planner: Planner, saved: SavedState, speed_mm_s: float, lift_mm: float = 0.0, *, left_out: bool = False
 ) -> bool:
-    """Let a job go on where SAVED says, and read as it did; offsets changed meanwhile and factors stay.
+    """Move back to SAVED and restore the job's frame; offsets changed meanwhile and factors stay.
 
-    X and Y are gone to at the greater height of both places, LIFT_MM above the one where it goes on.
+    X and Y are approached at the greater of both heights, LIFT_MM above the one where the job continues.
     LEFT_OUT: the head stays above it, and moves are left out from there on. False: the planner has to be
     emptied first. Raises WordError.
     """

@@ -1,6 +1,6 @@
 """Enable pins: a driver is switched on before its motor moves, and all are switched off by M84.
 
-SET_STEPPER_ENABLE is for trying out: it switches one, and those that share its pin.
+SET_STEPPER_ENABLE is for tests: it switches one driver, and those that share its pin.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ from nodes.devices.digital_out import DigitalOut
 from nodes.node.node import Node
 
 WAKE_S: Final = 0.1
-"""Drivers need a moment after they were switched on or off, before what comes next."""
+"""Drivers need this long after they were switched on or off."""
 
 
 class EnableLine(DigitalOut):
@@ -30,7 +30,7 @@ class EnableLine(DigitalOut):
         self.on = False
 
     def started(self, node: "Node") -> None:
-        """Take note that all is as configured: off."""
+        """Record that the drivers are off, as configured."""
         super().started(node)
         self.on = False
 
@@ -52,14 +52,14 @@ class MotorPower(Module):
         for line in self._lines:
             build.add_device(line.node, line)
         for name in ("M84", "M18"):
-            build.add_command(name, "Switch all motors off; nothing is homed any more", self._read_off)
+            build.add_command(name, "Switch all motors off; no axis is homed then", self._read_off)
         build.add_command("M17", "Switch all motors on", self._read_on)
         build.add_command(
             "SET_STEPPER_ENABLE", "Switch the motor STEPPER on or off (ENABLE=1, 0)", self._read_one
         )
 
     def stopped(self, cause: str) -> None:
-        """Take note that the nodes have switched all off."""
+        """Record that the nodes have switched all drivers off."""
         del cause
         for line in self._lines:
             line.on = False

@@ -1,4 +1,4 @@
-"""STEPPER_BUZZ: one motor goes a little way to and fro, to see which one it is and that it is wired."""
+"""STEPPER_BUZZ: moves one motor back and forth, to identify it and to check its wiring."""
 
 import math
 from typing import Final
@@ -24,7 +24,9 @@ class StepperBuzz(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._steppers = {stepper.name: stepper for stepper in build.machine.steppers}
-        build.add_command("STEPPER_BUZZ", "Move the motor STEPPER to and fro ten times, by 1 mm", self._read)
+        build.add_command(
+            "STEPPER_BUZZ", "Move the motor STEPPER back and forth ten times, by 1 mm or 1 degree", self._read
+        )
 
     def _read(self, call: Call) -> Reading:
         name = one(call.command, call.parameters("STEPPER"), "STEPPER", self._steppers)

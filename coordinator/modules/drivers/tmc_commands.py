@@ -25,16 +25,16 @@ class TmcCommands(Module):
         self._drivers: dict[str, TmcDriver] = {}
         self._wires: dict[tuple[str, str, str], TmcUart] = {}
         for name, text, read in (
-            ("INIT_TMC", "write all registers of the driver of STEPPER= again", self._init),
-            ("DUMP_TMC", "show the registers of the driver of STEPPER=, or only REGISTER=", self._dump),
+            ("INIT_TMC", "Write all registers of the driver of STEPPER= again", self._init),
+            ("DUMP_TMC", "Show the registers of the driver of STEPPER=, or only REGISTER=", self._dump),
             (
                 "SET_TMC_CURRENT",
-                "set the currents of the driver of STEPPER=: CURRENT= and HOLDCURRENT=, A RMS",
+                "Set the currents of the driver of STEPPER=: CURRENT= and HOLDCURRENT=, A RMS",
                 self._set_current,
             ),
             (
                 "SET_TMC_FIELD",
-                "set FIELD= of the driver of STEPPER= to VALUE=, or to what stands for VELOCITY= (mm/s)",
+                "Set FIELD= of the driver of STEPPER= to VALUE=, or to the value for VELOCITY= (mm/s)",
                 self._set_field,
             ),
         ):
@@ -56,11 +56,11 @@ class TmcCommands(Module):
         return self._wires[key], rx.node
 
     def add(self, driver: "TmcDriver", build: Build) -> None:
-        """Take in a DRIVER; raises ConfigError when its stepper or its address has one already."""
+        """Register DRIVER; raises ConfigError when its stepper or its address has one already."""
         for other in self._drivers.values():
             if other.stepper.name == driver.stepper.name:
                 raise ConfigError(
-                    build.place, f"[{other.name}] and [{driver.name}] are one stepper's; remove one"
+                    build.place, f"[{other.name}] and [{driver.name}] are for the same stepper; remove one"
                 )
             if other.wire is driver.wire and other.address == driver.address:
                 raise ConfigError(
@@ -108,8 +108,8 @@ class TmcCommands(Module):
         async def perform() -> Done:
             run_a = value(call.command, given, "CURRENT", driver.run_a)
             await driver.set_current(run_a, value(call.command, given, "HOLDCURRENT", driver.hold_a))
-            told = f"{driver.stepper.name}: run current {driver.run_a:g} A, hold current {driver.hold_a:g} A"
-            return Done((told,))
+            text = f"{driver.stepper.name}: run current {driver.run_a:g} A, hold current {driver.hold_a:g} A"
+            return Done((text,))
 
         return AtStandstill(perform)
 

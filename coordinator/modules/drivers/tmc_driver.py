@@ -1,8 +1,8 @@
 """[tmc2209 STEPPER], [tmc2208 STEPPER]: stepper drivers that are set, read and watched over a UART.
 
-What the driver has to be is kept in `values`: it is written when the driver's node is ready, and again when
-that comes back. Every WATCH_S the driver is asked how it is; with a fault that a motor must not move with,
-the machine stops and says why.
+`values` has what the registers have to be: they are written when the driver's node is ready, and again when
+the node comes back. Every WATCH_S the driver's status is read; on a fault with which a motor must not move
+the machine stops, with the cause.
 """
 
 import asyncio
@@ -35,11 +35,11 @@ from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
 WATCH_S: Final = 1.0
-"""How often a driver is asked how it is."""
+"""How often a driver's status is read."""
 SILENT_MAX: Final = 3
-"""So often in a row it may fail to answer that."""
+"""How often in a row it may fail to answer."""
 GSTAT_ALL: Final = 0b111
-"""Written, it takes the notes of a reset and of faults back."""
+"""Written, it clears the flags of a reset and of faults."""
 FEELING_SHARE: Final = 0.5
 """StallGuard acts from this share of the homing speed on: below, and at rest, its figures mean nothing."""
 
@@ -75,11 +75,11 @@ class TmcDriver(StallEndstop):
     # ------------------------------------------------------------------------------------------ device
 
     def configure(self, config: object) -> None:
-        """Have nothing on the node beside the wire, which is the commands'."""
+        """Do nothing: only the wire is on the node, and the commands have it."""
         del config
 
     def started(self, node: "Node") -> None:
-        """Take note that the driver may have forgotten all, as its NODE is ready."""
+        """Set the driver again, which may have lost its registers, as its NODE is ready."""
         del node
         if self._is_new is not None:
             self._is_new.set()
@@ -105,7 +105,7 @@ class TmcDriver(StallEndstop):
             self._watch.cancel()
 
     def status(self) -> Mapping[str, Value]:
-        """Tell its currents, A, and what it said last."""
+        """Report its currents, A, and the last status of the driver."""
         return {
             "run_current": self.run_a,
             "hold_current": self.hold_a,
@@ -142,8 +142,8 @@ class TmcDriver(StallEndstop):
         version = await self.read("IOIN") >> 24
         if version != self.CHIP.version and self._live is not None:
             self._live.say(
-                f"[{self.name}]: the driver says that its version is {version:#x}, which is none of a"
-                f" {self.CHIP.name.upper()} ({self.CHIP.version:#x}); check the section's name"
+                f"[{self.name}]: the driver reports version {version:#x}, but a {self.CHIP.name.upper()} has"
+                f" {self.CHIP.version:#x}; check the section's name"
             )
         await self.write(self.values)
         for name, value in self.values.items():
@@ -183,11 +183,11 @@ class TmcDriver(StallEndstop):
 
     @contextlib.asynccontextmanager
     async def feeling(self, speed: float) -> AsyncIterator[None]:
-        """Let StallGuard act while the axis moves at SPEED (mm/s): in StealthChop, as the chip asks for."""
+        """Enable StallGuard while the axis moves at SPEED (mm/s), in StealthChop as the chip requires."""
         threshold = self.settings.coolstep or speed * FEELING_SHARE
         if threshold >= speed:
             raise CanductorError(
-                f"{self._who} cannot feel the end of the axis at {speed:g} mm/s: its coolstep_threshold is"
+                f"{self._who} cannot detect the end of the axis at {speed:g} mm/s: its coolstep_threshold is"
                 f" {threshold:g} mm/s; home faster, or lower it"
             )
         fields = {"en_spreadcycle": 0, "tpwmthrs": 0, "tcoolthrs": self.settings.tstep(threshold)}
@@ -199,7 +199,7 @@ class TmcDriver(StallEndstop):
         try:
             yield
         except BaseException:
-            with contextlib.suppress(CanductorError):  # what it was called off for is told
+            with contextlib.suppress(CanductorError):  # the error that ended it is reported
                 await self.write(before)
             raise
         await self.write(before)
@@ -235,7 +235,7 @@ class TmcDriver(StallEndstop):
                     await asyncio.sleep(WATCH_S)
 
     def _check(self, gstat: int, drv_status: int) -> None:
-        """Take note of what the driver says; raises DriverFaultError."""
+        """Evaluate the driver's status registers; raises DriverFaultError."""
         register = self.CHIP.registers["DRV_STATUS"]
         said = {field.name: value for field in register.fields if (value := field.of(drv_status))}
         self._drv_status = said
@@ -265,7 +265,7 @@ class TmcDriver(StallEndstop):
 
 
 class DriverFaultError(CanductorError):
-    """A driver says that its motor must not move."""
+    """A driver reports a fault with which its motor must not move."""
 
 
 class Tmc2209(TmcDriver):

@@ -1,4 +1,4 @@
-"""[heater_fan NAME] and [controller_fan NAME]: fans that run while something else is hot or at work."""
+"""[heater_fan NAME] and [controller_fan NAME]: fans that run while a heater is hot or motors are on."""
 
 from typing import ClassVar, Final
 
@@ -21,7 +21,7 @@ FULL: Final = shutdown_speed(1.0)
 OFF: Final = shutdown_speed(0.0)
 HEATER: Final = ListOption(
     name="heater",
-    help="the heaters it belongs to; none: it never runs",
+    help="the heaters that it cools; none: it never runs",
     default=("extruder",),
     may_be_empty=True,
 )
@@ -34,18 +34,18 @@ HEATER_TEMP: Final = FloatOption(
     maximum=1500,
 )
 FAN_SPEED: Final = FloatOption(
-    name="fan_speed", help="how fast it then runs", default=1.0, minimum=0, maximum=1
+    name="fan_speed", help="its speed while it runs", default=1.0, minimum=0, maximum=1
 )
 IDLE_TIMEOUT: Final = IntOption(
     name="idle_timeout",
-    help="for how long it goes on at idle_speed when nothing is at work any more",
+    help="how long it runs at idle_speed after steppers and heaters were switched off",
     default=30,
     unit="s",
     minimum=0,
     maximum=1_000_000_000,
 )
 IDLE_SPEED: Final = FloatOption(
-    name="idle_speed", help="how fast it runs then; by default fan_speed", minimum=0, maximum=1
+    name="idle_speed", help="its speed then; by default fan_speed", minimum=0, maximum=1
 )
 STEPPER: Final = ListOption(
     name="stepper", help="the steppers it cools: it runs while one of them is on; by default all"
@@ -65,7 +65,7 @@ class _HeaterNames:
         self._heaters = build.shared(HeaterRegistry)
 
     def find(self, modules: Modules) -> list[Heater]:
-        """Return those that act; raises ConfigError. A default that does not exist is nobody's mistake."""
+        """Return those that act; raises ConfigError. A default that does not exist is no mistake."""
         known = {name: unit for unit in self._heaters.units.values() for name in (unit.key, unit.name)}
         found = []
         for name in self._names:
@@ -82,7 +82,7 @@ class HeaterFan(FanModule):
     KIND = "heater_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="A fan that runs while a heater is hot or is to be, as that of a hot end",
+        help="A fan that runs while a heater is hot or has a target, such as that of a hot end",
         options=(*fan_options(FULL), HEATER, HEATER_TEMP, FAN_SPEED),
         unsupported=UNSUPPORTED_FAN_OPTIONS,
     )
@@ -102,7 +102,7 @@ class HeaterFan(FanModule):
         self._heaters = self._names.find(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to look."""
+        """Start the periodic check."""
         await super().connect(live)
         live.every(LOOK_S, self._look)
 
@@ -115,7 +115,7 @@ class HeaterFan(FanModule):
 
 
 class ControllerFan(FanModule):
-    """A fan that cools a board while it is at work."""
+    """A fan that cools a board while its motors or heaters are on."""
 
     KIND = "controller_fan"
     NAMED: ClassVar = True
@@ -160,7 +160,7 @@ class ControllerFan(FanModule):
         self._heaters = self._names.find(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to look."""
+        """Start the periodic check."""
         await super().connect(live)
         live.every(LOOK_S, self._look)
 

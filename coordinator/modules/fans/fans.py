@@ -17,7 +17,7 @@ from coordinator.modules.fans.fan_unit import (
 
 OFF: Final = shutdown_speed(0.0)
 FULL: Final = 255.0
-"""The S of M106 that stands for full speed."""
+"""The S of M106 for full speed."""
 
 
 class Fan(FanModule):

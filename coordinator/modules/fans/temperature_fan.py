@@ -1,6 +1,6 @@
 """[temperature_fan NAME]: a fan that holds a temperature down.
 
-While its sensor says nothing, or what cannot be, it runs at its highest speed: nobody knows how hot it is.
+While its sensor is silent or out of range it runs at its highest speed: the temperature is unknown.
 """
 
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ from coordinator.support.values import Value
 FULL: Final = shutdown_speed(1.0)
 TARGET_TEMP: Final = FloatOption(
     name="target_temp",
-    help="temperature that is not to be exceeded; 0: the fan is off",
+    help="temperature that it must not exceed; 0: the fan is off",
     default=40.0,
     unit="°C",
     minimum=0,
@@ -54,7 +54,7 @@ CONTROL: Final = ChoiceOption(
     unsupported=("curve",),
 )
 MIRROR_C: Final = 5000.0
-"""Controllers heat: mirrored here, too hot becomes too cold."""
+"""Controllers heat: temperatures are mirrored at this one for a fan, which cools."""
 
 
 class TemperatureFans(Module):
@@ -65,7 +65,7 @@ class TemperatureFans(Module):
         self.by_name: dict[str, TemperatureFan] = {}
         build.add_command(
             "SET_TEMPERATURE_FAN_TARGET",
-            "Set what a temperature_fan holds: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
+            "Set the target of a temperature_fan: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
             self._set,
             while_printing=True,
         )
@@ -97,7 +97,7 @@ class TemperatureFan(FanModule):
     KIND = "temperature_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="A fan that holds a temperature down, as that of a board or a chamber",
+        help="A fan that keeps a temperature down, such as that of a board or a chamber",
         options=(
             *fan_options(FULL),
             *SENSOR_OPTIONS,
@@ -135,7 +135,7 @@ class TemperatureFan(FanModule):
         self.input.link(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
+        """Start acting."""
         await super().connect(live)
         await self.input.connect(live)
         live.every(LOOK_S, lambda: self._look(live))
@@ -157,7 +157,7 @@ class TemperatureFan(FanModule):
         self.unit.set_speed(min(max(wanted, self.min_speed), self.max_speed))
 
     def _look(self, live: "ModuleContext") -> None:
-        """Notice that there are no measurements any more."""
+        """Check that there still are measurements."""
         if self.input.missed() <= SILENT_LOOKS:
             return
         self.unit.set_speed(self.max_speed if self.target_c > 0 else 0.0)
@@ -165,7 +165,7 @@ class TemperatureFan(FanModule):
             return
         self._silent = True
         where = f"check node {self.input.node} and its wires" if self.input.node else "find out why"
-        live.say(f"[{self.name}] runs at its highest speed: its sensor says nothing any more; {where}")
+        live.say(f"[{self.name}] runs at its highest speed: its sensor is silent; {where}")
 
     def status(self) -> Mapping[str, Value]:
         """Report the fan and the temperature."""

@@ -49,7 +49,7 @@ class PidProfiles(Module):
         )
 
     def add(self, heater: str, name: str, gains: PidGains) -> None:
-        """Take a profile on; HEATER is what programs call it."""
+        """Add a profile; HEATER is its name in programs."""
         self._of.setdefault(heater, {})[name] = gains
 
     def heater(self, name: str) -> Heater | None:
@@ -72,7 +72,7 @@ class PidProfiles(Module):
         (action,) = actions
         name = given[action]
         if action == "GET_VALUES":
-            return Immediate((self._told(unit),))
+            return Immediate((self._report(unit),))
         if action == "REMOVE":
             raise WordError("a profile is removed by hand: delete its section from the configuration")
         if unit.settings.kind != "pid":
@@ -134,7 +134,7 @@ class PidProfiles(Module):
             texts = {"control": "pid", **_texts(controller.gains)}
             for option, text in texts.items():
                 live.save(f"{KIND} {unit.key} {name}", option, text)
-            live.say(f"profile {name} of {unit.key} is there from now on; SAVE_CONFIG writes it")
+            live.say(f"profile {name} of {unit.key} was saved; SAVE_CONFIG writes it")
 
         return Synchronized(act)
 
@@ -143,7 +143,7 @@ class PidProfiles(Module):
         if name not in own and len(own) >= PROFILES_MAX:
             raise WordError(f"{unit.key} has {PROFILES_MAX} profiles already; load one of them")
 
-    def _told(self, unit: Heater) -> str:
+    def _report(self, unit: Heater) -> str:
         if not isinstance(unit.controller, Pid):
             return f"{unit.key} is not controlled by PID"
         values = " ".join(f"{option}: {text}" for option, text in _texts(unit.controller.gains).items())

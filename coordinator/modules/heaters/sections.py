@@ -38,7 +38,7 @@ class HeaterSection(Module):
         self.unit.link(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
+        """Start acting."""
         await self.unit.connect(live)
 
     def end(self, cause: str) -> None:
@@ -64,7 +64,7 @@ class HeaterBed(HeaterSection):
         build.add_command("M190", "Set the bed's target and wait for it: S or R", self._wait)
 
     def _set(self, call: Call) -> Reading:
-        return self.heaters.set_in_time(self.unit, _target(call, "S"))
+        return self.heaters.set_target(self.unit, _target(call, "S"))
 
     def _wait(self, call: Call) -> Reading:
         return self.heaters.set_and_wait(self.unit, _target(call, "SR"))
@@ -98,7 +98,7 @@ class ExtruderHeaterCommands(Module):
         build.add_command("M109", "Set an extruder's target and wait for it: S or R, T", self._wait)
 
     def _set(self, call: Call) -> Reading:
-        return self.heaters.set_in_time(self._unit(call), _target(call, "ST"))
+        return self.heaters.set_target(self._unit(call), _target(call, "ST"))
 
     def _wait(self, call: Call) -> Reading:
         return self.heaters.set_and_wait(self._unit(call), _target(call, "SRT"))

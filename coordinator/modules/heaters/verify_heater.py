@@ -1,4 +1,4 @@
-"""[verify_heater NAME]: how strict the watch over a heater is."""
+"""[verify_heater NAME]: limits of the check that a heater heats."""
 
 from typing import ClassVar, Final
 
@@ -11,7 +11,7 @@ from coordinator.support.quoting import nearest_or_all
 
 MAX_ERROR: Final = FloatOption(
     name="max_error",
-    help="how much K·s below the range of the target may gather before all is stopped",
+    help="how much K·s below the range of the target may add up before the machine is stopped",
     default=120.0,
     unit="K·s",
     minimum=0,
@@ -27,7 +27,7 @@ CHECK_GAIN_TIME: Final = FloatOption(
 )
 HYSTERESIS: Final = FloatOption(
     name="hysteresis",
-    help="this near to its target a heater is in range",
+    help="range around the target",
     default=5.0,
     unit="K",
     minimum=0,
@@ -35,7 +35,7 @@ HYSTERESIS: Final = FloatOption(
 )
 HEATING_GAIN: Final = FloatOption(
     name="heating_gain",
-    help="how much hotter it has to get in check_gain_time",
+    help="by how much the temperature has to rise in check_gain_time",
     default=2.0,
     unit="K",
     above=0,
@@ -44,13 +44,13 @@ HEATING_GAIN: Final = FloatOption(
 
 
 class VerifyHeater(Module):
-    """How the heater of the section's instance is watched."""
+    """The limits of the heater that the section is named after."""
 
     KIND = "verify_heater"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="The watch over a heater (extruder, heater_bed or the name of a heater_generic); every heater"
-        " has it, the section only changes its values",
+        help="Limits of the check that a heater (extruder, heater_bed or the name of a heater_generic) heats;"
+        " every heater is checked, the section only changes the limits",
         options=(MAX_ERROR, CHECK_GAIN_TIME, HYSTERESIS, HEATING_GAIN),
     )
 

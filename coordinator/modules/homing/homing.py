@@ -46,35 +46,35 @@ class Homing(Module):
         self._feelers: dict[str, StallEndstop] = {}
         """By virtual endstop."""
         self.instead: Callable[[Call, str], Reading] | None = None
-        """Reads G28 in its place; a G28 among the lines that it stands for is homing again."""
+        """Reads G28 instead; a G28 among the lines that replace it homes."""
         self.corrected: Callable[[ReadHome], ReadHome] | None = None
-        """What homing finds, for programs whose X Y Z are not those of the axes."""
+        """Converts the result of homing, for programs whose X Y Z are not those of the axes."""
         build.add_command("M119", "Report which endstops are pressed", self._read_query)
         build.add_command("QUERY_ENDSTOPS", "Report which endstops are pressed", self._read_query)
 
     def status(self) -> Mapping[str, Value]:
-        """Report which endstops were pressed when somebody asked last."""
+        """Report which endstops were pressed at the last query."""
         return {"last_query": dict(self._last_query)}
 
     @property
     def acts(self) -> bool:
-        """Whether there is any endstop that it can look for."""
+        """Whether there is any endstop to home to."""
         return self.instead is not None or any(
             approach.possible or self._refusal(approach) for approach in self._approaches
         )
 
     def replace_by(self, read: Callable[[Call, str], Reading], build: Build) -> None:
-        """Have READ read G28, for the section that BUILD is of; raises ConfigError when another does."""
+        """Let READ read G28, for the section of BUILD; raises ConfigError when another section does."""
         if self.instead is not None:
             raise ConfigError(
                 build.place,
-                f"[{build.name}] and another section both say what G28 does; remove one:"
+                f"[{build.name}] and another section both replace G28; remove one:"
                 " [homing_override] can do what [safe_z_home] does",
             )
         self.instead = read
 
     def link(self, modules: Modules) -> None:
-        """Find the drivers that are to feel the end of an axis."""
+        """Find the drivers for sensorless homing."""
         for rail in (rail for approach in self._approaches for rail in approach.rails):
             virtual = rail.homing.virtual_endstop
             found = modules.find(section_of(virtual), StallEndstop) if virtual else None
@@ -96,7 +96,7 @@ class Homing(Module):
                 raise CanductorError(f"G28 of {approach.letters} is refused: {why}")
 
     def _refusal(self, approach: Approach) -> str:
-        """Say why nobody would know where the axes of APPROACH are after it; empty: it may be."""
+        """Return why the axes of APPROACH cannot be homed; empty: they can."""
         for rail in approach.rails:
             if rail.homing.refused:
                 return rail.homing.refused
@@ -159,7 +159,7 @@ class Homing(Module):
     async def _come_within(self, place: "Point", letters: str) -> "Point":
         """Move axes that stopped behind their endstop beyond their range back into it; return where they are.
 
-        By a step more than needed, as a way is made in whole steps. Towers and arms end within their space.
+        By a step more than needed, as moves are made of whole steps. Towers and arms end within their space.
         """
         described = self._described
         if self._live is None or not described.kinematics.straight:
@@ -233,8 +233,8 @@ class Homing(Module):
     async def _query(self) -> Done:
         rails = self._described.stops
         self._last_query = {rail.axis: await self._pressed(rail) for rail in rails}
-        told = [f"{axis}:{'pressed' if pressed else 'open'}" for axis, pressed in self._last_query.items()]
-        return Done((" ".join(told) or "this machine has no endstops on pins",), kind=ReplyKind.PLAIN)
+        states = [f"{axis}:{'pressed' if pressed else 'open'}" for axis, pressed in self._last_query.items()]
+        return Done((" ".join(states) or "this machine has no endstops on pins",), kind=ReplyKind.PLAIN)
 
     async def _any_pressed(self, rails: Sequence["RailDescription"]) -> bool:
         return any([await self._pressed(rail) for rail in rails])

@@ -1,4 +1,4 @@
-"""[safe_z_home]: Z is homed at a place of its own, with the head lifted before anything moves sideways."""
+"""[safe_z_home]: Z is homed at a given X and Y, and the head is lifted before it moves there."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -38,7 +38,7 @@ class PlaceOption(Option[tuple[float, float]]):
         return (0.0, 0.0)
 
 
-PLACE: Final = PlaceOption(name="home_xy_position", help="where the head is when Z is homed", unit="mm")
+PLACE: Final = PlaceOption(name="home_xy_position", help="position of the head while Z is homed", unit="mm")
 SPEED: Final = speed_option("speed", "of the way there", 50.0)
 Z_HOP: Final = FloatOption(
     name="z_hop",
@@ -51,17 +51,17 @@ Z_HOP: Final = FloatOption(
 Z_HOP_SPEED: Final = speed_option("z_hop_speed", "of the lift", 15.0)
 BACK: Final = BoolOption(
     name="move_to_previous",
-    help="whether X and Y go back to where they were before Z was homed",
+    help="whether X and Y move back to where they were before Z was homed",
     default=False,
 )
 
 
 class SafeZHome(Module):
-    """What G28 does in its place."""
+    """Replaces G28."""
 
     KIND = "safe_z_home"
     SPEC = SectionSpec(
-        "G28 homes Z at one place of the bed, behind X and Y",
+        "G28 homes Z at one position of the bed, after X and Y",
         (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK),
         unsupported=("home_y_before_x",),
     )

@@ -1,6 +1,6 @@
-"""[force_move]: moving one motor without homing, and saying where the head is. For trying out and for macros.
+"""[force_move]: moves one motor without homing, and sets the position of the head. For tests and macros.
 
-Nothing keeps these moves within the machine, so the section has to allow them. A motor of the head that was
+No limit applies to these moves, so the section has to enable them. A motor of the head that was
 moved alone leaves all axes unknown.
 """
 
@@ -17,7 +17,7 @@ from coordinator.runtime.moves.single import Ramp, SingleMove
 
 ENABLE: Final = BoolOption(
     name="enable_force_move",
-    help="whether there are FORCE_MOVE and SET_KINEMATIC_POSITION, which no limit of the machine applies to",
+    help="enables FORCE_MOVE and SET_KINEMATIC_POSITION, which ignore the limits of the machine",
     default=False,
 )
 DISTANCE_MAX_MM: Final = 1000.0
@@ -44,7 +44,7 @@ class ForceMove(Module):
         )
         build.add_command(
             "SET_KINEMATIC_POSITION",
-            "Say where the head is: X Y Z in mm; SET_HOMED and CLEAR_HOMED name axes",
+            "Set the position of the head: X Y Z in mm; SET_HOMED and CLEAR_HOMED name axes",
             self._read_position,
         )
 

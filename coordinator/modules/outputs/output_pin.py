@@ -19,16 +19,16 @@ from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
 PIN: Final = PinOption(name="pin", help="the output")
-PWM: Final = BoolOption(name="pwm", help="whether it may be anything from off to on, by PWM", default=False)
-VALUE: Final = FloatOption(name="value", help="what it has from the start on", default=0.0)
+PWM: Final = BoolOption(name="pwm", help="whether it takes values between off and on, by PWM", default=False)
+VALUE: Final = FloatOption(name="value", help="value at the start", default=0.0)
 SHUTDOWN_VALUE: Final = FloatOption(
     name="shutdown_value",
-    help="what it has when its node stops for safety; without hardware_pwm off or on",
+    help="value when its node stops for safety; without hardware_pwm off or on",
     default=0.0,
 )
 SCALE: Final = FloatOption(
     name="scale",
-    help="what 'on' is called: values of this section and of SET_PIN are 0 to scale",
+    help="value of 'on': values of this section and of SET_PIN are 0 to scale",
     default=1.0,
     above=0,
     maximum=1_000_000,
@@ -57,7 +57,7 @@ class OutputPins(Module):
         self.by_name: dict[str, OutputPin] = {}
         build.add_command(
             "SET_PIN",
-            "Set an output_pin at its place among the moves: PIN= VALUE=",
+            "Set an output_pin, synchronized with the moves: PIN= VALUE=",
             self._set,
             while_printing=True,
         )
@@ -135,7 +135,7 @@ class OutputPin(Module):
         """Do nothing: its output is a device of its own."""
 
     def started(self, node: "Node") -> None:
-        """Take note that its node has started, with the output as it was configured."""
+        """Record that the output has its start value: its node has started."""
         del node
         self._now = self._begin
         if self._live is not None and self._begins_late:
@@ -148,7 +148,7 @@ class OutputPin(Module):
             self.set(self._begin * self._scale)
 
     def set(self, wanted: float, print_time_s: float = 0.0) -> None:
-        """Have a value from a print time on, soon by default. Without effect while not connected."""
+        """Set a value from a print time on, soon by default. No effect while not connected."""
         live = self._live
         if live is None:
             return
@@ -161,7 +161,7 @@ class OutputPin(Module):
             else:
                 self._output.set(node, clock, share > 0)
         except CanductorError as error:
-            live.say(f"[{self.name}] cannot be set: {error}")
+            live.say(f"[{self.name}] was not set: {error}")
             return
         self._now = share
 
@@ -171,16 +171,16 @@ class OutputPin(Module):
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
-        """Tell its value."""
+        """Report its value."""
         return {"value": round(self._now * self._scale, 6)}
 
 
 class StaticDigitalOutput(Module):
-    """Outputs that have one value for ever."""
+    """Outputs that have one value."""
 
     KIND = "static_digital_output"
     NAMED: ClassVar = True
-    SPEC: ClassVar = SectionSpec(help="Outputs that are switched at the start, and stay so", options=(PINS,))
+    SPEC: ClassVar = SectionSpec(help="Outputs that are switched once, at the start", options=(PINS,))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from coordinator.gcode.builtins.state import go
-from coordinator.gcode.commands import AtStandstill, Call, ProgramContext, Reading, ToProgram
+from coordinator.gcode.commands import AtStandstill, Call, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.events import Done, Reply
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
@@ -102,7 +102,7 @@ class ManualProbe(Module):
             self._tell(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     # ------------------------------------------------------------------------------------------------ search
 
@@ -122,7 +122,7 @@ class ManualProbe(Module):
             self._tell(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _target(self, command: Command, word: str, z: float) -> float:
         below, above = self._beside(z)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import Call, Immediate, ProgramContext, Reading, ToProgram
+from coordinator.gcode.commands import Call, Immediate, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.parameters import flag, needed
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
@@ -35,7 +35,7 @@ class ExcludeObject(Module):
     """The objects of the program that is being read."""
 
     KIND = "exclude_object"
-    SPEC = SectionSpec("Leaving out single objects of a print", (), unsupported=("enable_exclude_object",))
+    SPEC = SectionSpec("Stop printing single objects of a job", (), unsupported=("enable_exclude_object",))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -48,16 +48,16 @@ class ExcludeObject(Module):
         """Whether no moves are left out, whatever is excluded: a program is read again up to where it was."""
         for name, help_, read, while_printing in (
             ("EXCLUDE_OBJECT_DEFINE", "Define an object: NAME, CENTER, POLYGON", self._define, False),
-            ("EXCLUDE_OBJECT_START", "An object begins", self._start, False),
-            ("EXCLUDE_OBJECT_END", "An object ends", self._end, False),
-            ("EXCLUDE_OBJECT", "Leave out an object from here on", self._exclude, True),
+            ("EXCLUDE_OBJECT_START", "Mark the begin of an object", self._start, False),
+            ("EXCLUDE_OBJECT_END", "Mark the end of an object", self._end, False),
+            ("EXCLUDE_OBJECT", "Stop printing an object", self._exclude, True),
         ):
             build.add_command(name, help_, read, while_printing=while_printing)
 
     def status(self) -> Mapping[str, Value]:
         """Report the objects, which of them are left out, and which one is being read."""
         return {
-            "objects": [_told(found) for found in tuple(self._objects.values())],
+            "objects": [_status(found) for found in tuple(self._objects.values())],
             "excluded_objects": [*sorted(self._excluded)],
             "current_object": self._current,
         }
@@ -78,7 +78,7 @@ class ExcludeObject(Module):
         self._current = other._current  # noqa: SLF001
 
     def begin_leaving_out(self, planner: "Planner") -> None:
-        """Take note that PLANNER leaves out moves: the program was in an excluded object before."""
+        """Record that PLANNER leaves out moves: the program was in an excluded object before."""
         self._retracted_mm = planner.retracted_mm
 
     def forget(self) -> None:
@@ -87,12 +87,12 @@ class ExcludeObject(Module):
         self._excluded.clear()
         self._current = self._retracted_mm = None
 
-    # ---- What a program tells ----
+    # ---- Commands of the program ----
 
     def _define(self, call: Call) -> Reading:
         values = call.parameters("NAME", "CENTER", "POLYGON", "RESET", "JSON")
         if flag(call.command, values, "RESET"):
-            return ToProgram(self._reset)
+            return ProgramAction(self._reset)
         if "NAME" not in values:
             return Immediate((f"Known objects: {' '.join(self._objects) or 'none'}",))
         found = _Object(
@@ -125,7 +125,7 @@ class ExcludeObject(Module):
             self._look(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _end(self, call: Call) -> Reading:
         call.parameters("NAME")
@@ -136,16 +136,16 @@ class ExcludeObject(Module):
                 self._current = None
             return done
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
-    # ---- What the user wants ----
+    # ---- Commands of the user ----
 
     def _exclude(self, call: Call) -> Reading:
         command = call.command
         values = call.parameters("NAME", "CURRENT", "RESET")
         name = values.get("NAME", "").upper()
         if flag(command, values, "RESET"):
-            return ToProgram(lambda job: self._take_back(job, name))
+            return ProgramAction(lambda job: self._take_back(job, name))
         if flag(command, values, "CURRENT"):
             name = self._current or ""
             if not name:
@@ -161,7 +161,7 @@ class ExcludeObject(Module):
             self._look(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _take_back(self, job: ProgramContext, name: str) -> bool:
         if (not name or name == self._current) and not self._make_moves(job):
@@ -172,7 +172,7 @@ class ExcludeObject(Module):
             self._excluded.clear()
         return True
 
-    # ---- What becomes of the moves ----
+    # ---- Excluding moves ----
 
     def _look(self, job: ProgramContext) -> None:
         """Leave out moves from here on, if this is an object to be left out."""
@@ -196,13 +196,13 @@ class ExcludeObject(Module):
         return True
 
 
-def _told(found: _Object) -> Value:
-    told: dict[str, Value] = {"name": found.name}
+def _status(found: _Object) -> Value:
+    status: dict[str, Value] = {"name": found.name}
     if found.center is not None:
-        told["center"] = list(found.center)
+        status["center"] = list(found.center)
     if found.polygon:
-        told["polygon"] = [list(point) for point in found.polygon]
-    return told
+        status["polygon"] = [list(point) for point in found.polygon]
+    return status
 
 
 def _point(command: Command, words: "list[str]") -> tuple[float, float]:

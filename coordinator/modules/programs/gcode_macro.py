@@ -1,4 +1,4 @@
-"""[gcode_macro NAME]: a command that stands for lines of g-code, made by a template when it is called."""
+"""[gcode_macro NAME]: a command that is replaced by lines of g-code, which a template renders."""
 
 import ast
 import re
@@ -15,7 +15,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.printer_status import PrinterStatus
 from coordinator.support.values import Value
 
-GCODE = GCodeOption(name="gcode", help="What is done: g-code, with Jinja2 between { } and {% %}")
+GCODE = GCodeOption(name="gcode", help="What is run: g-code, with Jinja2 between { } and {% %}")
 RENAME = TextOption(
     name="rename_existing",
     help="Name for the command that had this macro's name before, such as M109.1 or BASE_PAUSE",
@@ -102,7 +102,7 @@ class GCodeMacro(Module):
 
     KIND = "gcode_macro"
     SPEC = SectionSpec(
-        "A command of its own: NAME, in capitals, stands for lines of g-code",
+        "A macro: the command NAME, in capitals, runs these lines of g-code",
         (GCODE, RENAME, DESCRIPTION),
         family=VARIABLE,
     )
@@ -134,7 +134,7 @@ class GCodeMacro(Module):
 
     @property
     def text(self) -> str:
-        """What it stands for, as it is written."""
+        """Its template, as it is written."""
         return self._template.text
 
     def _read(self, call: Call) -> Reading:
@@ -143,13 +143,16 @@ class GCodeMacro(Module):
 
 
 class Variables(Module):
-    """What all macros have in common."""
+    """SET_GCODE_VARIABLE, for all macros."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._macros: dict[str, GCodeMacro] = {}
         build.add_command(
-            "SET_GCODE_VARIABLE", "Give a macro's variable another value", self._set, while_printing=True
+            "SET_GCODE_VARIABLE",
+            "Set a variable of a macro: MACRO, VARIABLE, VALUE",
+            self._set,
+            while_printing=True,
         )
 
     def link(self, modules: Modules) -> None:

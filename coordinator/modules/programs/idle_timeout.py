@@ -1,4 +1,4 @@
-"""[idle_timeout]: what is done when nothing was done for a while; by default heaters and motors go off.
+"""[idle_timeout]: acts when the machine was idle for a while; by default heaters and motors are switched off.
 
 Every machine has it, with its defaults where there is no such section.
 """
@@ -16,7 +16,7 @@ from coordinator.support.values import Value
 
 TIMEOUT = FloatOption(
     name="timeout",
-    help="How long nothing may happen; a job that is paused counts as nothing",
+    help="How long the machine may be idle; while a job is paused it counts as idle",
     default=600.0,
     unit="s",
     above=0.0,
@@ -24,7 +24,7 @@ TIMEOUT = FloatOption(
 )
 GCODE = GCodeOption(
     name="gcode",
-    help="What is done then; without it, TURN_OFF_HEATERS and M84, as far as there are heaters and motors",
+    help="What is run then; by default TURN_OFF_HEATERS and M84, where there are heaters and motors",
     default="",
 )
 OFF: Final = ("TURN_OFF_HEATERS", "M84")
@@ -32,10 +32,10 @@ LOOK_S: Final = 1.0
 
 
 class IdleTimeout(Module):
-    """Watches, and acts."""
+    """Watches for idleness and acts."""
 
     KIND = "idle_timeout"
-    SPEC = SectionSpec("What is done when the machine is left alone", (TIMEOUT, GCODE))
+    SPEC = SectionSpec("What is run when the machine is idle", (TIMEOUT, GCODE))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -48,12 +48,12 @@ class IdleTimeout(Module):
         self._works = 0
         self._acting = False
         build.add_command(
-            "SET_IDLE_TIMEOUT", "Let nothing happen for TIMEOUT", self._set, while_printing=True
+            "SET_IDLE_TIMEOUT", "Set the idle time-out: TIMEOUT, s", self._set, while_printing=True
         )
-        build.add_command("_IDLE_TIMEOUT", "What is done when nothing happens", self._lines)
+        build.add_command("_IDLE_TIMEOUT", "Run what [idle_timeout] does", self._lines)
 
     def link(self, modules: Modules) -> None:
-        """Find what there is to switch off."""
+        """Find out what can be switched off."""
         self._default = tuple(name for name in OFF if modules.knows(name))
 
     async def connect(self, live: "ModuleContext") -> None:
@@ -68,7 +68,7 @@ class IdleTimeout(Module):
         self._live, self._state = None, "Idle"
 
     def status(self) -> Mapping[str, Value]:
-        """Tell Printing, Ready or Idle, and for how long it has been printing, s."""
+        """Report Printing, Ready or Idle, and for how long it has been printing, s."""
         printing_s = 0.0
         if self._live is not None and self._busy_since_s is not None:
             printing_s = self._live.now_s() - self._busy_since_s
@@ -79,12 +79,12 @@ class IdleTimeout(Module):
         }
 
     def look(self) -> None:
-        """See whether anything happens; on the control loop."""
+        """Check whether the machine is idle; on the control loop."""
         live = self._live
         if live is None or (runner := live.machine.runner) is None:
             return
         now_s = live.now_s()
-        if self._acting:  # what it does itself is no sign of life
+        if self._acting:  # its own lines do not count as activity
             self._acting, self._works = runner.busy, runner.works
             return
         works, self._works = self._works, runner.works
@@ -100,11 +100,11 @@ class IdleTimeout(Module):
             self._state = "Idle"
             if self._template is None and not self._default:
                 return
-            live.say(f"nothing happened for {self._timeout_s:g} s: {self._told()}")
+            live.say(f"the machine was idle for {self._timeout_s:g} s: {self._action()}")
             runner.run_lines("idle_timeout", ["_IDLE_TIMEOUT"])
             self._acting = True
 
-    def _told(self) -> str:
+    def _action(self) -> str:
         return (
             "the g-code of [idle_timeout] runs" if self._template is not None else " and ".join(self._default)
         )

@@ -1,4 +1,4 @@
-"""[pause_resume]: PAUSE, RESUME, CANCEL_PRINT and CLEAR_PAUSE, from the job itself or beside it.
+"""[pause_resume]: PAUSE, RESUME, CANCEL_PRINT and CLEAR_PAUSE, from the job itself or from a client.
 
 PAUSE remembers where the job stands; what its macro does afterwards (parking, drawing filament back) comes
 behind that. RESUME goes back there and lets the job go on.
@@ -9,7 +9,7 @@ from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.builtins.state import save_state
-from coordinator.gcode.commands import Call, ProgramContext, Reading, ToProgram
+from coordinator.gcode.commands import Call, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.events import Reply
 from coordinator.gcode.parameters import bounded
 from coordinator.modules.base import Build, Module
@@ -18,7 +18,7 @@ from coordinator.support.values import Value
 
 VELOCITY = FloatOption(
     name="recover_velocity",
-    help="How fast RESUME goes back, unless its VELOCITY says otherwise",
+    help="Speed at which RESUME moves back, unless it has a VELOCITY",
     default=50.0,
     unit="mm/s",
     above=0.0,
@@ -32,7 +32,7 @@ class PauseResume(Module):
     """The commands."""
 
     KIND = "pause_resume"
-    SPEC = SectionSpec("Pausing a job, by g-code", (VELOCITY,))
+    SPEC = SectionSpec("Pause and resume a job by g-code", (VELOCITY,))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -42,14 +42,14 @@ class PauseResume(Module):
         build.shared(PrintStats)
         for name, help_, read in (
             ("PAUSE", "Pause the job", self._pause),
-            ("RESUME", "Go back to where the job was paused, and let it go on", self._resume),
-            ("CANCEL_PRINT", "End the job", self._cancel),
-            ("CLEAR_PAUSE", "Forget that there was a pause", self._clear),
+            ("RESUME", "Move back to where the job was paused and resume it", self._resume),
+            ("CANCEL_PRINT", "Cancel the job", self._cancel),
+            ("CLEAR_PAUSE", "Clear the paused state without resuming", self._clear),
         ):
             build.add_command(name, help_, read, while_printing=True)
 
     def status(self) -> Mapping[str, Value]:
-        """Return whether there is a pause."""
+        """Report whether there is a pause."""
         return {"is_paused": self._paused}
 
     def job_begins(self) -> None:
@@ -57,7 +57,7 @@ class PauseResume(Module):
         self._paused = False
 
     def resumed(self) -> None:
-        """Take note that the job goes on, by whatever means."""
+        """Record that the job goes on, whatever resumed it."""
         self._paused = False
 
     def _pause(self, call: Call) -> Reading:
@@ -75,7 +75,7 @@ class PauseResume(Module):
                 job.notice("PAUSE", "there is no job to pause: only a service (canductor run) has jobs")
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _resume(self, call: Call) -> Reading:
         values = call.parameters("VELOCITY")
@@ -93,7 +93,7 @@ class PauseResume(Module):
                 prints.resume_job()
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _cancel(self, call: Call) -> Reading:
         call.parameters()
@@ -104,7 +104,7 @@ class PauseResume(Module):
                 job.prints.cancel_job(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _clear(self, call: Call) -> Reading:
         call.parameters()
@@ -113,4 +113,4 @@ class PauseResume(Module):
             self._paused = False
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)

@@ -1,4 +1,4 @@
-"""SAVE_CONFIG, RESTART and FIRMWARE_RESTART: what was calibrated is kept, and the machine restarts."""
+"""SAVE_CONFIG, RESTART and FIRMWARE_RESTART."""
 
 import asyncio
 
@@ -10,7 +10,7 @@ from nodes.support.errors import CanductorError
 
 
 class SaveConfig(Module):
-    """The commands that end one life of the machine."""
+    """The commands that restart the machine."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -18,7 +18,7 @@ class SaveConfig(Module):
         for name, text, read in (
             (
                 "SAVE_CONFIG",
-                "Write what was calibrated into the configuration file, then restart",
+                "Write calibrated values into the configuration file, then restart",
                 self._read_save,
             ),
             (
@@ -28,7 +28,7 @@ class SaveConfig(Module):
             ),
             (
                 "FIRMWARE_RESTART",
-                "Do that with all nodes reset, also those whose configuration is the same",
+                "RESTART with a reset of all nodes, also of those whose configuration is the same",
                 lambda call: self._read_restart(call, firmware=True),
             ),
         ):

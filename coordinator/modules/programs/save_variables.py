@@ -1,8 +1,7 @@
-"""[save_variables]: values that outlive the machine, in a file of their own.
+"""[save_variables]: variables that survive a restart, in a file of their own.
 
-The file is written by a thread, so that neither programs nor the control loop wait for a disk; whole or not
-at all, so that a power cut leaves the old values or the new ones. A machine that is only planned keeps what
-it is told in memory.
+The file is written by a thread, so that neither programs nor the control loop wait for a disk; atomically, so
+that a power cut leaves the old values or the new ones. A machine that is only planned keeps them in memory.
 """
 
 import threading
@@ -33,7 +32,7 @@ class SaveVariables(Module):
     """The values, and the file that has them."""
 
     KIND = "save_variables"
-    SPEC = SectionSpec("Values that are kept in a file (SAVE_VARIABLE)", (FILENAME,))
+    SPEC = SectionSpec("Variables that are kept in a file (SAVE_VARIABLE)", (FILENAME,))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -43,7 +42,7 @@ class SaveVariables(Module):
         self._variables: dict[str, Any] = {}
         self._writer: _Writer | None = None
         build.add_command(
-            "SAVE_VARIABLE", "Keep VALUE as VARIABLE in the file", self._save, while_printing=True
+            "SAVE_VARIABLE", "Save VALUE as VARIABLE in the file", self._save, while_printing=True
         )
 
     def link(self, modules: Modules) -> None:  # noqa: ARG002

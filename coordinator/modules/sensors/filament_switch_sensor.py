@@ -1,4 +1,4 @@
-"""[filament_switch_sensor NAME]: a switch that is pressed while there is filament; without it jobs pause."""
+"""[filament_switch_sensor NAME]: a switch that detects filament; jobs pause when it runs out."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -19,19 +19,19 @@ PIN: Final = PinOption(
 )
 PAUSE: Final = BoolOption(
     name="pause_on_runout",
-    help="whether a job pauses, by PAUSE if there is [pause_resume]; if not, it goes on behind runout_gcode,"
+    help="whether a job pauses, by PAUSE if there is [pause_resume]; if not, it goes on after runout_gcode,"
     " unless that pauses it",
     default=True,
 )
 RUNOUT: Final = GCodeOption(
-    name="runout_gcode", help="What is done when a job runs out of filament", default=""
+    name="runout_gcode", help="What is run when a job runs out of filament", default=""
 )
 INSERT: Final = GCodeOption(
-    name="insert_gcode", help="What is done when filament comes while no job prints", default=""
+    name="insert_gcode", help="What is run when filament is inserted while no job prints", default=""
 )
 EVENT_DELAY: Final = FloatOption(
     name="event_delay",
-    help="How long after an event, and after the start, others are passed over",
+    help="How long after an event, and after the start, further events are ignored",
     default=3.0,
     unit="s",
     minimum=0.0,
@@ -55,7 +55,7 @@ class FilamentSwitchSensor(Module):
 
     KIND = "filament_switch_sensor"
     SPEC = SectionSpec(
-        "A switch that tells whether there is filament",
+        "A switch that detects filament",
         (PIN, PAUSE, RUNOUT, INSERT, EVENT_DELAY),
         unsupported=LATER,
     )
@@ -92,7 +92,7 @@ class FilamentSwitchSensor(Module):
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
-        """Return whether there is filament, and whether that counts."""
+        """Report whether there is filament, and whether the sensor is enabled."""
         return {"filament_detected": self.switch.pressed, "enabled": self.enabled}
 
     def _changed(self, there: bool) -> None:
@@ -106,27 +106,27 @@ class FilamentSwitchSensor(Module):
         if there:
             runner.run_lines(self.name, [f"{_INSERT} SENSOR={self.id}"], self.insert.text)
             return
-        live.say(f"{self.name}: there is no filament any more")
+        live.say(f"{self.name}: the filament has run out")
         lines = ["PAUSE"] if self._pauses and self._can_pause else []
         runner.run_paused(self.name, [*lines, f"{_RUNOUT} SENSOR={self.id}"], stay=self._pauses)
 
 
 class FilamentSensors(Module):
-    """The commands of all."""
+    """The commands for all sensors."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._all: dict[str, FilamentSwitchSensor] = {}
         for name, help_, read in (
             ("QUERY_FILAMENT_SENSOR", "Report whether SENSOR has filament", self._query),
-            ("SET_FILAMENT_SENSOR", "Let SENSOR count (ENABLE=1) or not (0)", self._set),
-            (_RUNOUT, "What is done when filament runs out", self._runout),
-            (_INSERT, "What is done when filament comes", self._insert),
+            ("SET_FILAMENT_SENSOR", "Enable SENSOR (ENABLE=1) or disable it (0)", self._set),
+            (_RUNOUT, "Run runout_gcode", self._runout),
+            (_INSERT, "Run insert_gcode", self._insert),
         ):
             build.add_command(name, help_, read, while_printing=True)
 
     def link(self, modules: Modules) -> None:
-        """Find them."""
+        """Find all sections."""
         self._all = {found.id: found for found in modules.of(FilamentSwitchSensor)}
 
     def _sensor(self, call: Call, *others: str) -> tuple[FilamentSwitchSensor, Mapping[str, str]]:

@@ -1,4 +1,4 @@
-"""[gcode_button NAME]: g-code that is run when a button is pressed, or let go."""
+"""[gcode_button NAME]: g-code that is run when a button is pressed or released."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -13,8 +13,8 @@ from coordinator.support.values import Value
 from nodes.devices.button import Button
 
 PIN: Final = PinOption(name="pin", help="input of the button; pressed is high, with ! low", pullable=True)
-PRESS: Final = GCodeOption(name="press_gcode", help="What is done when it is pressed")
-RELEASE: Final = GCodeOption(name="release_gcode", help="What is done when it is let go", default="")
+PRESS: Final = GCodeOption(name="press_gcode", help="What is run when it is pressed")
+RELEASE: Final = GCodeOption(name="release_gcode", help="What is run when it is released", default="")
 LATER: Final = ("analog_range", "analog_pullup_resistor", "debounce_delay")
 _COMMAND: Final = "_BUTTON"
 
@@ -42,7 +42,7 @@ class GCodeButton(Module):
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
-        """Return whether it is pressed."""
+        """Report whether it is pressed."""
         return {"state": "PRESSED" if self._button.pressed else "RELEASED"}
 
     def _changed(self, pressed: bool) -> None:
@@ -57,7 +57,7 @@ class GCodeButton(Module):
 
 
 class GCodeButtons(Module):
-    """The commands of all."""
+    """The commands for all buttons."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -65,10 +65,10 @@ class GCodeButtons(Module):
         build.add_command(
             "QUERY_BUTTON", "Report whether BUTTON is pressed", self._query, while_printing=True
         )
-        build.add_command(_COMMAND, "What a button does", self._run, while_printing=True)
+        build.add_command(_COMMAND, "Run the g-code of a button", self._run, while_printing=True)
 
     def link(self, modules: Modules) -> None:
-        """Find them."""
+        """Find all sections."""
         self._all = {found.id: found for found in modules.of(GCodeButton)}
 
     def _query(self, call: Call) -> Reading:

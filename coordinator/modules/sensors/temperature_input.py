@@ -67,7 +67,7 @@ class TemperatureInput(TemperatureSource):
         build.add_device(self._pin.node, self._analog, self._pin)
 
     def link(self, modules: Modules) -> None:
-        """Find out what the sensor is, and what its converter may read; raises ConfigError."""
+        """Find the sensor, and what its converter may read; raises ConfigError."""
         self._sensor = self._find(modules)
         if not self._guarded:
             return
@@ -98,17 +98,17 @@ class TemperatureInput(TemperatureSource):
         if self._type in FREE_SENSORS:
             return self._reader.bad(
                 SENSOR_TYPE,
-                "which no node can watch: a heater needs a sensor on a pin, with a net of its own",
+                "which no node can check: a heater needs a sensor on a pin, whose limits its node checks",
             )
         own = [name.partition(" ")[2] for kind in KINDS.values() for name in modules.names(kind)]
         hint = nearest(self._type, (*KNOWN_SENSORS, *own), pattern="'{}'")
         add = f"; add a section [thermistor {self._type}]"
         return self._reader.bad(SENSOR_TYPE, f"but there is no sensor {shown(self._type)}{hint or add}")
 
-    # ---------------------------------------------------------------------------------------------- live
+    # ----------------------------------------------------------------------------------------- connected
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to tell what is measured; waits for the first time, unless its node is away."""
+        """Start reporting measurements; waits for the first one, unless its node is absent."""
         await super().connect(live)
         if self.celsius is None and live.node(self._pin.node).state is NodeState.READY:
             await self.next()

@@ -1,4 +1,4 @@
-"""[temperature_sensor NAME]: a temperature that is only watched."""
+"""[temperature_sensor NAME]: a temperature that is only reported."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Final
@@ -18,7 +18,7 @@ from coordinator.support.values import Value
 
 GCODE_ID: Final = TextOption(
     name="gcode_id",
-    help="what M105 calls it; without one it does not tell it",
+    help="its name in M105; without one M105 does not report it",
     pattern=r"[A-Za-z][A-Za-z0-9_]*",
     pattern_rule="a letter, and letters and digits",
 )
@@ -30,7 +30,7 @@ class TemperatureSensor(SensorModule):
     KIND = "temperature_sensor"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="A temperature that is watched; with min_temp or max_temp its node stops all outside them",
+        help="A temperature that is reported; outside min_temp or max_temp its node stops the machine",
         options=(*SENSOR_OPTIONS, *FREE_SENSOR_OPTIONS, GCODE_ID),
         unsupported=UNSUPPORTED_SENSOR_OPTIONS,
     )
@@ -47,7 +47,7 @@ class TemperatureSensor(SensorModule):
         self.input.link(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to measure."""
+        """Start measuring."""
         await self.input.connect(live)
 
     def end(self, cause: str) -> None:

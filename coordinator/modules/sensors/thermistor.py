@@ -136,7 +136,7 @@ def _given(build: Build) -> Iterator[tuple[float, bool, float]]:
         if at is None or value is None or (v is not None and r is not None):
             raise ConfigError(
                 build.place,
-                f"[{build.name}]: '{celsius.name}' needs either '{volts.name}' or '{ohms.name}' beside it",
+                f"[{build.name}]: '{celsius.name}' needs either '{volts.name}' or '{ohms.name}' as well",
             )
         if kind is not None and kind is not (v is not None):
             raise ConfigError(build.place, f"[{build.name}] mixes voltages and resistances; use one kind")

@@ -1,4 +1,4 @@
-"""What macros see of the machine besides its modules: nodes, the computer, the commands there are."""
+"""What macros see of the machine in addition to its modules: nodes, the computer, the commands."""
 
 import os
 import time
@@ -34,7 +34,7 @@ def machine_view(modules: Modules, live: "ModuleContext | None") -> Mapping[str,
             "state": "ready" if stopped is None else "shutdown",
             "state_message": "Printer is ready" if stopped is None else str(stopped),
         },
-        # As if there were the section: macros ask whether anything goes on.
+        # As if there were the section: macros ask whether the machine is busy.
         "idle_timeout": {
             "state": "Ready" if runner is not None and not runner.busy else "Printing",
             "printing_time": 0.0,

@@ -19,13 +19,13 @@ class Positions(Module):
         )
 
     def _read(self, call: Call) -> Reading:
-        told = frames(call.figures())
+        lines = frames(call.figures())
         if call.while_printing:
-            return Immediate(told)
-        return AtStandstill(lambda: self._tell(told), Done(told))
+            return Immediate(lines)
+        return AtStandstill(lambda: self._report(lines), Done(lines))
 
-    async def _tell(self, told: tuple[str, ...]) -> Done:
-        """Answer with what the nodes count, what follows from that, and what the program was TOLD."""
+    async def _report(self, lines: tuple[str, ...]) -> Done:
+        """Report what the nodes count, what follows from that, and the LINES of the program's frames."""
         machine = self.live.machine
         counts = await machine.query_stepper_counts()
         places = machine.stepper_positions.positions(counts)
@@ -36,4 +36,4 @@ class Positions(Module):
         kinematic = (
             unknown if head is None else " ".join(f"{a}:{v:.6f}" for a, v in zip("XYZ", head, strict=True))
         )
-        return Done((f"mcu: {mcu}", f"stepper: {stepper or unknown}", f"kinematic: {kinematic}", *told))
+        return Done((f"mcu: {mcu}", f"stepper: {stepper or unknown}", f"kinematic: {kinematic}", *lines))

@@ -1,6 +1,6 @@
-"""``printer.print_stats``: how the job is, for macros and front ends; SET_PRINT_STATS_INFO.
+"""``printer.print_stats``: the state of the job, for macros and front ends; SET_PRINT_STATS_INFO.
 
-A service tells it; where there is none, nothing is ever printed.
+A service reports it; without one nothing is ever printed.
 """
 
 from collections.abc import Mapping
@@ -28,8 +28,8 @@ class PrintStats(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "print_stats"
-        self.told: Mapping[str, Value] = NOTHING
-        """By the service; replaced, never changed."""
+        self.job: Mapping[str, Value] = NOTHING
+        """What the service reports of the job; replaced, never changed."""
         self._total: int | None = None
         self._current: int | None = None
         build.add_command(
@@ -42,21 +42,21 @@ class PrintStats(Module):
     @property
     def state(self) -> str:
         """standby, printing, paused, complete, cancelled or error."""
-        return str(self.told["state"])
+        return str(self.job["state"])
 
     def job_begins(self) -> None:
         """Forget layers."""
         self._total = self._current = None
 
     def forget(self) -> None:
-        """Forget a job that has ended; one that has not, the service tells again."""
-        self.told = NOTHING
+        """Forget a job that has ended; one that has not, the service reports again."""
+        self.job = NOTHING
         self.job_begins()
 
     def status(self) -> Mapping[str, Value]:
         """Report all."""
         layers: dict[str, Value] = {"total_layer": self._total, "current_layer": self._current}
-        return {**self.told, "info": layers}
+        return {**self.job, "info": layers}
 
     def _set(self, call: Call) -> Reading:
         values = call.parameters("TOTAL_LAYER", "CURRENT_LAYER")

@@ -1,4 +1,4 @@
-"""[respond]: RESPOND shows a line to the user, with a prefix that tells its kind; so does M118."""
+"""[respond]: RESPOND shows a line to the user, with a prefix for its kind; so does M118."""
 
 from coordinator.config.options import ChoiceOption, SectionSpec, TextOption
 from coordinator.gcode.commands import Call, Immediate, Reading
@@ -10,7 +10,7 @@ PREFIXES = {"echo": "echo:", "command": "//", "error": "!!"}
 TYPE = ChoiceOption(
     name="default_type", help="Kind of a line without one", default="echo", choices=tuple(PREFIXES)
 )
-PREFIX = TextOption(name="default_prefix", help="Stands before a line, instead of that of default_type")
+PREFIX = TextOption(name="default_prefix", help="Prefix of a line, instead of that of default_type")
 
 
 class Respond(Module):

@@ -258,7 +258,7 @@ class StepGenerator:
         self._check_settled(status, f"the shaper of axis {axis}", f"impulses {list(impulses)}")
 
     def set_weights(self, stepper: int, weights: Position) -> None:
-        """Let STEPPER, which has no formula, follow other axes from now on.
+        """Make STEPPER, which has no formula, follow other axes from now on.
 
         Raises StepError unless all has settled.
         """

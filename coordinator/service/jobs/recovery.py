@@ -225,7 +225,7 @@ class Recovery:
                 " is no file to go on with; have them sent again",
             )
         if service.active_job is not None:
-            raise ApiError("busy", "a job is on its way; wait for its end, or cancel it")
+            raise ApiError("busy", "a job is active; wait for its end, or cancel it")
         if how.line is not None and how.line > found.line:
             raise ApiError(
                 "bad_params", f"{found.file} was interrupted at line {found.line}, before {how.line}"

@@ -26,7 +26,7 @@ PRINT_RADIUS = length_option(
     "print_radius",
     "how far from the middle the head may be; by default delta_radius, or less where rods lie too flat",
 )
-PRINTER = SectionSpec(help="What a delta needs besides", options=(DELTA_RADIUS, PRINT_RADIUS, MINIMUM_Z))
+PRINTER = SectionSpec(help="Further options of a delta", options=(DELTA_RADIUS, PRINT_RADIUS, MINIMUM_Z))
 ARM_LENGTH = length_option(
     "arm_length", "length of the rods, from joint to joint; by default that of stepper_a"
 )

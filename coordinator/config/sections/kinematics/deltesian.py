@@ -25,7 +25,7 @@ MIN_ANGLE = FloatOption(
 )
 PRINT_WIDTH = length_option("print_width", "range of X, centred; by default what min_angle allows")
 PRINTER = SectionSpec(
-    help="What a deltesian needs besides",
+    help="Further options of a deltesian",
     options=(MINIMUM_Z, MIN_ANGLE, PRINT_WIDTH),
     unsupported=("slow_ratio",),
 )

@@ -30,7 +30,7 @@ CARRIAGE = SectionSpec(
 )
 PRIMARY_CARRIAGE = TextOption(
     name="primary_carriage",
-    help="the [carriage NAME] beside which it runs",
+    help="the [carriage NAME] on whose axis it runs",
     pattern=r"\S+",
     pattern_rule="the name of a carriage",
 )

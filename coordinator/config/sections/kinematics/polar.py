@@ -11,7 +11,7 @@ from coordinator.kinematics.polar import Polar
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
 PRINTER = SectionSpec(
-    help="What a polar machine may have besides", options=(), unsupported=("max_angular_velocity",)
+    help="Further options of a polar machine", options=(), unsupported=("max_angular_velocity",)
 )
 BED = SectionSpec(
     help="The motor that turns the bed of a polar machine",

@@ -29,7 +29,7 @@ PRINT_RADIUS = length_option(
     "print_radius", "how far from the middle the head may be; by default what gives the largest cylinder"
 )
 PRINTER = SectionSpec(
-    help="What a rotary delta needs besides",
+    help="Further options of a rotary delta",
     options=(SHOULDER_RADIUS, SHOULDER_HEIGHT, PRINT_RADIUS, MINIMUM_Z),
 )
 UPPER_LENGTH = length_option(

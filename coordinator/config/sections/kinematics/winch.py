@@ -71,7 +71,7 @@ def _check_anchors(readers: list[SectionReader], anchors: tuple[Point, ...]) -> 
     if math.sqrt(dot(normal, normal)) < _MIN_SINE * math.sqrt(dot(to_b, to_b) * dot(to_c, to_c)):
         raise readers[2].bad(
             ANCHORS[0],
-            "the anchors of stepper_a, stepper_b and stepper_c are on one line; place one beside it",
+            "the anchors of stepper_a, stepper_b and stepper_c are on one line; move one off it",
         )
 
 
