@@ -389,7 +389,7 @@ def test_what_a_console_asks(fed: Fed) -> None:
     status, firmware, *command_help = fed.output
     assert status == "ready"
     assert firmware.startswith("FIRMWARE_NAME:canductor FIRMWARE_VERSION:")
-    assert "M24: Print the chosen file, or let the paused job go on" in command_help
+    assert "M24: Print the selected file, or resume the paused job" in command_help
     assert "G28: Home X, Y, Z, or all axes" in command_help
     assert not [line for line in command_help if line.startswith("_")]
     fed.job("STATUS")
