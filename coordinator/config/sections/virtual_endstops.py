@@ -8,12 +8,11 @@ from typing import Final
 from coordinator.config.file import ConfigFile
 from coordinator.config.options import BadValue, SectionReader
 from coordinator.config.pins import PinName, PinOption, PinRegistry
+from coordinator.drivers.tmc_chips import CHIPS
 from coordinator.support.quoting import nearest, shown
 
-STALL_KINDS: Final = ("tmc2209",)
+STALL_KINDS: Final = tuple(name for name, chip in CHIPS.items() if chip.has_stallguard)
 """First words of the sections of drivers that can detect the end of an axis."""
-NUMB_KINDS: Final = ("tmc2208",)
-"""Of those that cannot."""
 NAME: Final = "virtual_endstop"
 _DIAG: Final = PinOption(name="diag_pin", help="", pullable=True)
 
@@ -39,7 +38,7 @@ def find_diag_pin(
     Raises ConfigError for a driver that does not exist or has no diag_pin.
     """
     kind, _, stepper = pin.node.partition("_")
-    if kind in NUMB_KINDS:
+    if kind in CHIPS and kind not in STALL_KINDS:
         raise reader.bad(option, f"but a {kind.upper()} cannot detect the end of an axis; use a switch")
     if kind not in STALL_KINDS:
         return None
