@@ -48,6 +48,14 @@ RETIRED = {
     "DncReport": "PlainReport",
     "ServeReport": "PlainReport",
     "ScenarioList": "PlainReport",
+    "ToProgram": "ProgramAction",
+    "MachineModules": "Modules",
+    "ConfiguresNodes": "configure_modules",
+    "Pinned": "Build.add_device(node, device, pin)",
+    "add_pinned": "Build.add_device(node, device, pin)",
+    "ConfigView": "config_view",
+    "set_in_time": "set_target",
+    "add_timed": "nothing: outputs have queue slots of their own",
 }
 """By the name that is refused: what to write instead."""
 SEARCHED = ("coordinator", "nodes", "canbus_tools", "tests", "bench", "docs", "README.md", "CONTRIBUTING.md")

@@ -1,4 +1,4 @@
-"""How a mistake in a configuration is told: the place first, then what is wrong, then what to do."""
+"""Errors of a configuration: the place first, then what is wrong, then what to do."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ class Place:
     path: str
     """The file as the user would type it, not resolved."""
     line: int
-    """Counted from 1; 0 speaks of the file as a whole."""
+    """Counted from 1; 0: the file as a whole."""
 
     def __str__(self) -> str:
         return f"{self.path}:{self.line}" if self.line else self.path

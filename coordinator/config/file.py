@@ -57,13 +57,13 @@ class RawSection:
     problems: list[ConfigError] | None = None
     """Where mistakes are collected; None: the first one ends the reading."""
     set_aside: set[str] = field(default_factory=set)
-    """Options that are known to be wrong and were taken out: nobody is to miss them."""
+    """Options that are known to be wrong and were taken out: they are not reported as missing."""
     is_set_aside: bool = False
     """Whether all of them were."""
     misspelt: bool = False
     """Whether it has an option that looks like another: then others may only seem to be too much."""
     stands_in: bool = False
-    """Whether anything of it was read as a value that nobody gave."""
+    """Whether a stand-in value was used for any of its options."""
     used: dict[str, object] = field(default_factory=dict)
     """What its readers made of it so far: values and defaults, by option."""
 

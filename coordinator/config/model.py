@@ -37,7 +37,7 @@ class UartConnection:
 
 
 class NodePolicy(Enum):
-    """What becomes of the machine when a node is lost, shuts down or restarts; the value is its word."""
+    """What happens to the machine when a node is lost, shuts down or restarts; the value is its word."""
 
     FATAL = "fatal"
     """All nodes are stopped."""

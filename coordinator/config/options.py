@@ -6,13 +6,13 @@ handed back.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawOption, RawSection
-from coordinator.support.quoting import nearest, shown
+from coordinator.support.quoting import nearest, nearest_or_all, shown
 
 T = TypeVar("T")
 _FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
@@ -404,12 +404,20 @@ class SectionReader:
         return option.stand_in()
 
     def bad(self, option: Option[T], sentence: str) -> ConfigError:
-        """Return the error for a value; the sentence goes on after "option 'x' of [y] is 'z', "."""
+        """Return the error for a value; the sentence continues after "option 'x' of [y] is 'z', "."""
         raw = self.section.options.get(option.name)
         given = f" is {shown(raw.value)}," if raw else ""
         return ConfigError(
             self.place_of(option), f"option '{option.name}' of [{self.name}]{given} {sentence}"
         )
+
+    def unknown(
+        self, option: Option[Any], name: str, known: Iterable[str], pattern: str = "{}"
+    ) -> ConfigError:
+        """Return the error for an option that names NAME, which is none of KNOWN."""
+        hint = nearest_or_all(name, known, pattern=pattern)
+        sentence = f"'{option.name}' of [{self.name}] names {shown(name)}, which does not exist{hint}"
+        return ConfigError(self.place_of(option), sentence)
 
     def finish(self) -> tuple[RawOption, ...]:
         """Return the options that wait for their module; raises ConfigError for one of no use here."""
@@ -424,7 +432,7 @@ class SectionReader:
                 self.section.report(
                     ConfigError(
                         option.place,
-                        f"option '{option.name}' of [{self.name}] has no effect beside the others; remove it",
+                        f"option '{option.name}' of [{self.name}] has no effect with the others; remove it",
                     )
                 )
         return tuple(unread)

@@ -91,7 +91,7 @@ class PinOption(Option[PinName]):
         return "a pin as in PA3 or toolhead:PA3" + (f", may begin with {' or '.join(marks)}" if marks else "")
 
     def stand_in(self) -> PinName:
-        """Return a pin that there is not."""
+        """Return a pin that does not exist."""
         return NO_PIN
 
     def setting(self, text: str, value: PinName) -> object:
@@ -121,7 +121,7 @@ class PinRegistry:
     """Names of the sections [multi_pin NAME], whose pins are all behind ``multi_pin:``."""
 
     def copy(self) -> "PinRegistry":
-        """Return one that goes on from here by itself."""
+        """Return an independent copy."""
         return PinRegistry(
             self.nodes,
             dict(self._aliases),
@@ -141,7 +141,7 @@ class PinRegistry:
             )
 
     def allow_sharing(self, pin: PinName) -> None:
-        """Let several options use one pin ([duplicate_pin_override])."""
+        """Allow several options to use one pin ([duplicate_pin_override])."""
         self._shareable.add((pin.node, self._aliases.get((pin.node, pin.name), pin.name)))
 
     def claim(self, pin: PinName, option: PinOption, section: RawSection) -> PinDescription:

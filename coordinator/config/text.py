@@ -74,7 +74,7 @@ def enter_file(path: str, place: Place, budget: ReadBudget) -> None:
     try:
         status = Path(path).stat()
     except (OSError, ValueError):
-        identity = (-1, -1)  # read_lines tells the reason
+        identity = (-1, -1)  # read_lines reports the reason
     else:
         identity = (status.st_dev, status.st_ino)
         if identity in budget.open_files:
@@ -87,7 +87,7 @@ def enter_file(path: str, place: Place, budget: ReadBudget) -> None:
 def included_paths(pattern: str, place: Place, budget: ReadBudget) -> list[str]:
     """Expand the pattern of an ``[include …]`` relative to the file it stands in, sorted by name.
 
-    A pattern with wildcards may match nothing; a plain name must exist (reading it tells).
+    A pattern with wildcards may match nothing; a plain name must exist (reading it reports that).
     """
     base = str(Path(place.path).parent / pattern)
     if not any(c in pattern for c in _WILDCARDS):

@@ -85,6 +85,11 @@ UNDERVOLTAGE: Final = "has too low a motor supply; check the power supply and it
 FORGOTTEN: Final = "has lost its settings: its motor supply was off for a moment; check the power supply"
 
 
+def _bits(first: int, names: str) -> tuple[Field, ...]:
+    """Return fields of one bit each, from bit FIRST on."""
+    return tuple(Field(name, shift) for shift, name in enumerate(names.split(), first))
+
+
 def _registers(*registers: Register) -> dict[str, Register]:
     return {register.name: register for register in sorted(registers, key=lambda one: one.address)}
 
@@ -92,17 +97,10 @@ def _registers(*registers: Register) -> dict[str, Register]:
 _GCONF: Final = Register(
     "GCONF",
     0x00,
-    (
-        Field("i_scale_analog", 0),
-        Field("internal_rsense", 1),
-        Field("en_spreadcycle", 2),
-        Field("shaft", 3),
-        Field("index_otpw", 4),
-        Field("index_step", 5),
-        Field("pdn_disable", 6),
-        Field("mstep_reg_select", 7),
-        Field("multistep_filt", 8),
-        Field("test_mode", 9),
+    _bits(
+        0,
+        "i_scale_analog internal_rsense en_spreadcycle shaft index_otpw index_step pdn_disable"
+        " mstep_reg_select multistep_filt test_mode",
     ),
     writable=True,
 )
@@ -135,10 +133,7 @@ _COMMON: Final = (
             Field("tbl", 15, 2),
             Field("vsense", 17),
             Field("mres", 24, 4),
-            Field("intpol", 28),
-            Field("dedge", 29),
-            Field("diss2g", 30),
-            Field("diss2vs", 31),
+            *_bits(28, "intpol dedge diss2g diss2vs"),
         ),
         writable=True,
     ),
@@ -146,21 +141,9 @@ _COMMON: Final = (
         "DRV_STATUS",
         0x6F,
         (
-            Field("otpw", 0),
-            Field("ot", 1),
-            Field("s2ga", 2),
-            Field("s2gb", 3),
-            Field("s2vsa", 4),
-            Field("s2vsb", 5),
-            Field("ola", 6),
-            Field("olb", 7),
-            Field("t120", 8),
-            Field("t143", 9),
-            Field("t150", 10),
-            Field("t157", 11),
+            *_bits(0, "otpw ot s2ga s2gb s2vsa s2vsb ola olb t120 t143 t150 t157"),
             Field("cs_actual", 16, 5),
-            Field("stealth", 30),
-            Field("stst", 31),
+            *_bits(30, "stealth stst"),
         ),
     ),
     Register(

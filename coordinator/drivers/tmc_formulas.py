@@ -11,7 +11,7 @@ TSTEP_MAX: Final = 0xFFFFF
 _FULL_SCALE_V: Final = {0: 0.325, 1: 0.18}
 """By vsense; of a TMC2209 and a TMC2208."""
 _INNER_OHM: Final = 0.02
-"""Beside the sense resistor: bond wires and copper."""
+"""In series with the sense resistor: bond wires and copper."""
 _SCALES: Final = 32
 
 

@@ -1,1 +1,1 @@
-"""G-code programs: reading them, acting on their lines, and what they tell whoever drives them."""
+"""G-code programs: parser, interpreter, commands, and the events that drive the machine."""

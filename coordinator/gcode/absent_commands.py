@@ -1,8 +1,8 @@
-"""Commands that users of other hosts know and that nothing acts on here: whose they are, what they would do.
+"""Commands of other hosts that are not supported here: which section brings them, what they would do.
 
 A line that would move, heat or level something and is skipped leaves a print that is not what its file says:
 where the configuration has a section for it, it is an error in a job. What only shows, lights or measures is
-skipped with a notice, as is any command that nobody knows, and what a machine has nothing for.
+skipped with a notice, as is any unknown command, and any for which the machine has no section.
 """
 
 from collections.abc import Mapping
@@ -12,13 +12,13 @@ from typing import Final
 
 
 class Effect(Enum):
-    """What a command does to a print; the value goes on after the command's name."""
+    """What a command does to a print; the value continues after the command's name."""
 
     MOVES = "moves something"
     HEATS = "heats something"
     LEVELS = "measures or corrects where the bed is"
     NONE = "does nothing to a print"
-    """Lights, displays, measurements that are only told."""
+    """Lights, displays, measurements that are only reported."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,14 +3,14 @@
 ``read`` runs as soon as the line is read, in the reader's thread, also when a program is only planned: it
 checks the parameters (WordError) and returns what is to be done and when. It changes nothing itself.
 
-============  ===============================================================================================
-Immediate     is done when it is read: an answer, or a value for the lines to come
-Synchronized  is done when the moves before it are carried out, without stopping them: a fan
-ToProgram     acts on the program that reads it: on its modes, on where its moves go
-AtStandstill  is done at standstill, and the program waits for it: a heater to become hot, homing
-Lines         is replaced by other lines: a macro
-BuiltIn       is what the interpreter makes of another name: a command whose name a macro has taken
-============  ===============================================================================================
+=============  ==============================================================================================
+Immediate      is done when it is read: a reply, or a value for the lines to come
+Synchronized   is done when the moves before it are carried out, without stopping them: a fan
+ProgramAction  acts on the program that reads it: on its modes, on where its moves go
+AtStandstill   is done at standstill, and the program waits for it: a heater to become hot, homing
+Lines          is replaced by other lines: a macro
+BuiltIn        is the interpreter's own command of another name: one whose name a macro has taken
+=============  ==============================================================================================
 """
 
 from abc import ABC, abstractmethod
@@ -43,7 +43,7 @@ class Call:
     extruder: str = ""
     """The active extruder; empty where there is none."""
     figures: Callable[[], Mapping[str, Mapping[str, object]]] = dict
-    """Return ``toolhead`` and ``gcode_move`` as they are there (gcode/figures.py)."""
+    """Return ``toolhead`` and ``gcode_move`` as they are there (gcode/status.py)."""
     while_printing: bool = False
     """Whether a client gives it while a job prints, which must not wait for it."""
 
@@ -81,7 +81,7 @@ class AtStandstill:
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """TEXT takes the command's place; before that, REPLIES are told."""
+    """TEXT takes the command's place; before that, REPLIES are given."""
 
     text: str
     replies: tuple[str, ...] = ()
@@ -90,7 +90,7 @@ class Lines:
 
 
 @dataclass(frozen=True, slots=True)
-class ToProgram:
+class ProgramAction:
     """ACT changes what holds for the program's lines to come; False: with the planner emptied, once more.
 
     It is called in the reader's thread, also when a program is only planned; raises WordError.
@@ -106,7 +106,7 @@ class BuiltIn:
     name: str
 
 
-Reading = Immediate | Synchronized | AtStandstill | Lines | ToProgram | BuiltIn
+Reading = Immediate | Synchronized | AtStandstill | Lines | ProgramAction | BuiltIn
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ class GCodeCommand:
 def renamed(command: GCodeCommand | None, name: str, rename: str, *, while_printing: bool) -> GCodeCommand:
     """Return what NAME was, under another name: COMMAND, or without one the interpreter's own.
 
-    WHILE_PRINTING: whether that one may be given beside a job.
+    WHILE_PRINTING: whether that one may be given while a job prints.
     """
     if command is None:
         return GCodeCommand(
@@ -168,7 +168,7 @@ NO_WORDS = Vocabulary({})
 
 @dataclass(frozen=True, slots=True)
 class Recovering:
-    """How an interrupted job is to go on."""
+    """How an interrupted job is resumed."""
 
     line: int | None = None
     """None: where it was."""
@@ -192,7 +192,7 @@ class PrintControl(Protocol):
         ...
 
     def pause_job(self, program: "ProgramContext") -> None:
-        """Let the job read no further, by a line of PROGRAM; that goes on to the end of the line.
+        """Pause the job, by a line of PROGRAM, which continues to the end of the line.
 
         Where the program stands is where the job will go on.
         """
@@ -205,16 +205,16 @@ class PrintControl(Protocol):
         ...
 
     def resume_job(self) -> None:
-        """Let the job go on when the program at hand has ended."""
+        """Resume the job when the present program has ended."""
 
     def cancel_job(self, program: "ProgramContext") -> None:
-        """End the job, by a line of PROGRAM; that goes on to the end of the line."""
+        """Cancel the job, by a line of PROGRAM, which continues to the end of the line."""
 
     def start_job(self, name: str) -> None:
-        """Print the file NAME of the job folder when the program at hand has ended."""
+        """Print the file NAME of the job folder when the present program has ended."""
 
     def recover_job(self, how: Recovering) -> None:
-        """Go on with the interrupted job when the program at hand has ended."""
+        """Resume the interrupted job when the present program has ended."""
 
 
 class ProgramContext(ABC):
@@ -245,10 +245,6 @@ class ProgramContext(ABC):
         """Report WHAT with a remark, once per program."""
 
     @abstractmethod
-    def record(self, command: Command) -> None:
-        """Count COMMAND; only its last parameters are kept, so memory stays flat."""
-
-    @abstractmethod
     def refuse_skipping(self, command: Command, why: str) -> None:
         """Raise WordError for a COMMAND that a job must not go without; a plan only reports it.
 
@@ -269,7 +265,7 @@ class ProgramContext(ABC):
 
     @abstractmethod
     def break_after_line(self) -> None:
-        """Let ``step`` return as soon as the line at hand is done, with all that it stands for."""
+        """Make ``step`` return as soon as the present line is done, with all lines that replace it."""
 
     @abstractmethod
     def end_with(self, event: Event) -> None:

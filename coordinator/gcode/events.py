@@ -1,4 +1,4 @@
-"""What a ``Job`` tells whoever drives it. Lines count from 1; print times are seconds (docs/architecture.md).
+"""Events that a ``Job`` returns to its driver. Lines count from 1; print times are s (docs/architecture.md).
 
 ==============  ==========================================================================================
 event           what the driver does before it calls ``step`` again
@@ -7,12 +7,12 @@ Progress        nothing
 Idle            waits for input; plans what there is to a standstill before the machine runs dry
 Full            takes and releases trapezoids (a streamer: waits until there is room, or raises plan_until_s)
 Wait            takes all trapezoids; in real time, waits until PRINT_TIME_S has been executed
-PositionSet     takes all trapezoids, then tells step generation where the machine stands
-ShaperChange,   takes all trapezoids, generates their steps up to PRINT_TIME_S with flush, then tells step
-WeightsChange,  generation what changed; the machine has been at rest for longer than every shaper and every
+PositionSet     takes all trapezoids, then sets the position of step generation
+ShaperChange,   takes all trapezoids, generates their steps up to PRINT_TIME_S with flush, then changes
+WeightsChange,  step generation; the machine has been at rest for longer than every shaper and every
 SmoothTime-     smoothing window is wide
 Change
-Timed           calls ACT with the print time at which the next move begins; goes on meanwhile
+Timed           calls ACT with the print time at which the next move begins; continues meanwhile
 Standstill-     takes all trapezoids; in real time, waits until PRINT_TIME_S has been executed, has it
 Action          performed and keeps the result in the event
 Reply, Notice   shows the text
@@ -29,7 +29,7 @@ from coordinator.gcode.reply_kinds import ReplyKind
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What came of something that was done at rest."""
+    """The result of an action at standstill."""
 
     replies: tuple[str, ...] = ()
     position: tuple[float, float, float, float] | None = None
@@ -151,7 +151,7 @@ class StandstillAction:
     moved: bool = False
     """Whether steppers may have been moved past the program's moves."""
     cancelled: bool = False
-    """Set by whoever does not want it any more; the driver then ends it."""
+    """Set to cancel it; the driver then ends it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """Something the user should know; each is told once per job."""
+    """Something the user should know; each is reported once per job."""
 
     line: int
     text: str

@@ -20,10 +20,10 @@ from coordinator.gcode.commands import (
     Immediate,
     Lines,
     PrintControl,
+    ProgramAction,
     ProgramContext,
     Reading,
     Synchronized,
-    ToProgram,
     Vocabulary,
 )
 from coordinator.gcode.errors import GCodeError
@@ -55,16 +55,6 @@ MAX_DEPTH = 30
 """Commands that stand in for a command that stands in for a command ..."""
 MAX_PLACES = 4
 """Of such commands that a message names all; of more, it names the outermost and the innermost one."""
-
-
-@dataclass(slots=True)
-class Recorded:
-    """Commands of one name that wait for a module which does not exist yet."""
-
-    count: int
-    first_line: int
-    last_line: int
-    last_text: str
 
 
 @dataclass(slots=True)
@@ -125,13 +115,11 @@ class Job(ProgramContext):
         self.strict = strict
         """Whether a line that moves, heats or levels and that nothing acts on is an error; else a notice."""
         self._breaks = False
-        self.recorded: dict[str, Recorded] = {}
-        """By command name."""
         self._events: deque[Event] = deque()
         self._inner: list[_Inner] = []
-        self._resting: StandstillAction | None = None
+        self._action: StandstillAction | None = None
         self._over: Event | GCodeError | None = None
-        self._told: set[str] = set()
+        self._noticed: set[str] = set()
         planner.forget_line()
         planner.leave_out(READ_IN_C if while_printing else vocabulary.commands)
         for set_up in vocabulary.set_ups:
@@ -149,7 +137,7 @@ class Job(ProgramContext):
         return self.planner.lines + 1
 
     def step(self) -> Event:
-        """Work until there is something to tell; at most one piece of the program (64 KiB).
+        """Work until there is an event; at most one piece of the program (64 KiB).
 
         Waits for input only where the program's source does (pipes, standard input).
         """
@@ -164,8 +152,8 @@ class Job(ProgramContext):
             filament = self.machine.filament
             self.planner.cold = self.vocabulary.too_cold(filament.active if filament is not None else "")
             try:
-                if self._resting is not None:
-                    self._rested(self._resting)
+                if self._action is not None:
+                    self._take_result(self._action)
                 elif self._inner:
                     self._advance_inner(self._inner[-1])
                 else:
@@ -181,25 +169,25 @@ class Job(ProgramContext):
 
     @property
     def settled(self) -> bool:
-        """Whether all is taken over that was done at rest, and all is told."""
-        return self._resting is None and not self._events
+        """Whether the result of every action at standstill is taken over, and no event waits."""
+        return self._action is None and not self._events
 
     def break_after_line(self) -> None:
-        """Let ``step`` return as soon as the line at hand is done, with all that it stands for."""
+        """Make ``step`` return as soon as the present line is done, with all lines that replace it."""
         self._breaks = True
 
     def attend_others(self) -> Event | None:
-        """Return that there is nothing: it is all there is."""
+        """Return None: no other lines come between those of the program."""
         return None
 
     def pending(self) -> Event | None:
-        """Take over what was done at rest, and return what is to be told without reading on; None: nothing.
+        """Take over the result of an action at standstill; return a waiting event, None: there is none.
 
         Raises GCodeError.
         """
-        if self._resting is not None and not self._events:
+        if self._action is not None and not self._events:
             try:
-                self._rested(self._resting)
+                self._take_result(self._action)
             except GCodeError as error:
                 self._over = error
                 raise
@@ -277,7 +265,7 @@ class Job(ProgramContext):
             raise self._error(f"{problem}{hint}") from None
 
     def _act_noting(self, command: Command) -> bool:
-        """Act on COMMAND, and tell what of it was ignored."""
+        """Act on COMMAND, and report parameters that were ignored."""
         ignored: list[str] = []
         done = self._act(replace(command, ignored=ignored))
         for key in ignored:
@@ -306,7 +294,7 @@ class Job(ProgramContext):
         return True
 
     def _skip(self, command: Command) -> None:
-        """Tell about a command that nobody knows; raises WordError for one that a job must not go without."""
+        """Report an unknown command; raises WordError for one that a job must not skip."""
         what = quoted(command.name).strip(QUOTE)
         why = self.vocabulary.unsupported.get(command.name, "")
         absent = ABSENT.get(command.name)
@@ -316,7 +304,7 @@ class Job(ProgramContext):
         self.refuse_skipping(command, f"{absent.effect.value}, but {why}")
 
     def refuse_skipping(self, command: Command, why: str) -> None:
-        """Raise WordError as COMMAND, of which WHY says what it does, must not be skipped; told in a plan."""
+        """Raise WordError: COMMAND, which does what WHY says, must not be skipped; a plan reports it."""
         if self.strict:
             raise WordError(f"{command.name} {why}; remove the line, or what asks for it")
         self.notice(f"{quoted(command.name).strip(QUOTE)} {why}", "a job would end here")
@@ -353,22 +341,22 @@ class Job(ProgramContext):
                 if not machine_commands.come_to_standstill(self):
                     return False
                 end_s = self.planner.print_time_end_s
-                self._resting = StandstillAction(self.line, end_s, reading.perform, reading.planned)
-                self._events.append(self._resting)
+                self._action = StandstillAction(self.line, end_s, reading.perform, reading.planned)
+                self._events.append(self._action)
             case Lines():
                 if len(self._inner) >= MAX_DEPTH:
                     raise WordError(self._too_deep(command.name))
                 self._reply(reading.replies)
                 data = reading.text.encode(errors="replace")
                 self._inner.append(_Inner(command.name, data, where=reading.where))
-            case ToProgram():
+            case ProgramAction():
                 return reading.act(self)
             case BuiltIn():
                 return self._act_built_in(command.called(reading.name))
         return True
 
-    def _rested(self, event: StandstillAction) -> None:
-        self._resting = None
+    def _take_result(self, event: StandstillAction) -> None:
+        self._action = None
         if event.moved and event.done is None:
             self.planner.homed = ""
         if event.failure:
@@ -377,7 +365,7 @@ class Job(ProgramContext):
             self.take(event.done)
 
     def take(self, done: Done) -> None:
-        """Take over what was done at rest."""
+        """Take over the result of an action at standstill."""
         planner = self.planner
         self._reply(done.replies, done.kind)
         planner.homed = "".join(axis for axis in planner.homed if axis not in done.unhomed)
@@ -411,24 +399,17 @@ class Job(ProgramContext):
         return GCodeError(self.program.name, line or self.line, f"{within}{problem}")
 
     def notice(self, what: str, remark: str) -> None:
-        """Tell about WHAT, but only once in this job."""
-        if what in self._told or len(self._told) > MAX_NOTICES:
+        """Report WHAT with a REMARK, once in this job."""
+        if what in self._noticed or len(self._noticed) > MAX_NOTICES:
             return
-        self._told.add(what)
+        self._noticed.add(what)
         text = f"{self.program.name}:{self.line}: {what}: {remark}"
-        if len(self._told) > MAX_NOTICES:
+        if len(self._noticed) > MAX_NOTICES:
             text = f"{self.program.name}:{self.line}: more than {MAX_NOTICES} notices: no more are shown"
         self._events.append(Notice(self.line, text))
 
-    def record(self, command: Command) -> None:
-        """Count COMMAND; only its last parameters are kept, so memory stays flat."""
-        seen = self.recorded.setdefault(command.name, Recorded(0, self.line, self.line, ""))
-        seen.count += 1
-        seen.last_line = self.line
-        seen.last_text = command.text
-
     def emit(self, event: Event) -> None:
-        """Tell EVENT with the next ``step``."""
+        """Return EVENT from the next ``step``."""
         self._events.append(event)
 
     def end_with(self, event: Event) -> None:

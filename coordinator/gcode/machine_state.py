@@ -13,6 +13,8 @@ from coordinator.kinematics.extruder import ExtruderMotion
 from coordinator.motion.specs import MotionLimits
 
 SHAPER_AXES = "XYZ"
+DEFAULT_STATE = "default"
+"""The name of a saved state, where none is given."""
 SHAPER_PERIODS = 2.0
 """No shaper is wider than this many periods of its frequency."""
 

@@ -31,7 +31,7 @@ class Command:
     written: str = ""
     """In capitals as it stands in the line, where that is not NAME: ``G00``, ``M104.0``."""
     ignored: list[str] | None = None
-    """Takes in the parameters that had no meaning for who read them, for a notice; None: nobody asks."""
+    """Collects the parameters that the reader ignored, for a notice; None: they are not reported."""
 
     def called(self, name: str) -> "Command":
         """Return the same command under another NAME."""
@@ -155,10 +155,10 @@ def _without_frame(line: bytes) -> bytes:
     is_code = numbered or (line[:1] in b"GMTgmt" and line[1:2].isdigit())
     if is_code and (star := _CHECKSUM.search(code)):
         expected = reduce(xor, code[: star.start()], 0)
-        told = star[1].decode("ascii", "replace")
-        if told != str(expected):
+        given = star[1].decode("ascii", "replace")
+        if given != str(expected):
             raise WordError(
-                f"the checksum is {quoted(told)}, but the line adds up to {expected}; copy the file again"
+                f"the checksum is {quoted(given)}, but the line adds up to {expected}; copy the file again"
             )
         line = code[: star.start()]
     return line[numbered.end() :] if numbered else line

@@ -56,7 +56,7 @@ class _Typed:
         return os.read(self._fd, size) if self._poll.poll(0) else None
 
     def close(self) -> None:
-        """Leave standard input to others."""
+        """Leave standard input open."""
 
 
 class Program:
@@ -78,7 +78,7 @@ class Program:
         self.final = False
         """Whether the window reaches the end of the program."""
         self.end_bytes: int | None = None
-        """Where it ends for whoever wants to read no further."""
+        """Where reading ends, if before the end of the file."""
         self._source = source
         self._read_bytes = 0
 

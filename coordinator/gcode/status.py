@@ -55,13 +55,13 @@ def motion_figures(planner: Planner, machine: MachineState) -> Mapping[str, Mapp
 
 def _extruders(machine: MachineState) -> Mapping[str, Mapping[str, object]]:
     followed = {} if machine.filament is None else machine.filament.followed
-    told: dict[str, dict[str, object]] = {}
+    found: dict[str, dict[str, object]] = {}
     for stepper, queue in followed.items():
         name = stepper if stepper in machine.extruders else f"extruder_stepper {stepper}"
-        told[name] = {"motion_queue": queue or None}
+        found[name] = {"motion_queue": queue or None}
     for name, extruder in machine.extruders.items():
-        told[name] |= {"pressure_advance": extruder.pressure_advance_s, "smooth_time": extruder.smooth_s}
-    return told
+        found[name] |= {"pressure_advance": extruder.pressure_advance_s, "smooth_time": extruder.smooth_s}
+    return found
 
 
 def _carriages(machine: MachineState) -> Mapping[str, Mapping[str, object]]:

@@ -1,7 +1,7 @@
 """The temperature sensor inside a micro-controller, by its chip: from the makers' data sheets.
 
 All are lines from voltage to temperature, with the converter's reference taken as 3.3 V. What a data sheet
-gives is typical: single chips are up to some 10 °C beside it. Chips that were measured at the factory have
+gives is typical: single chips are up to some 10 °C off. Chips that were measured at the factory have
 two points in their memory; these are taken if they make sense.
 
 =============  =====================================================================================

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 SETTLING_S: Final = 10.0
-"""So long after a heater has reached its target it may still swing."""
+"""How long a heater may swing after it has reached its target."""
 
 
 @dataclass(frozen=True, slots=True)

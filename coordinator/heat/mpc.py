@@ -3,7 +3,7 @@
 The model: a block of CAPACITY takes power and loses heat to the surroundings (more with the fan on) and into
 filament that passes; the sensor follows the block with a lag. An observer corrects block and sensor with
 every measurement. What the model cannot explain (another ambient temperature, a supply voltage 5 % off) it
-learns as a flow of heat, so that the temperature settles on the target and not beside it.
+learns as a flow of heat, so that the temperature settles on the target.
 
 Observer gains: errors of block temperature (e_b), sensor temperature (e_s) and unexplained heat (e_d) follow
     e_s' = k e_b - (k + L_s) e_s      e_b' = -λ e_b + e_d / C - L_b e_s      e_d' = -L_d e_s
@@ -12,7 +12,6 @@ OBSERVER_SPEED · k: fast against the sensor's lag, yet not so fast that noise i
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -98,14 +97,14 @@ class Mpc:
         self._to_block = (3 * w**2 - (3 * w - loss) * loss) / k
         self._to_heat = w**3 * capacity / k
 
-    # ---------------------------------------------------------------------------------- what goes on outside
+    # ------------------------------------------------------------------------------------------ disturbances
 
     def set_fan(self, speed: float) -> None:
-        """Take note that the fan that cools the block runs at SPEED, 0..1."""
+        """Set the speed of the fan that cools the block, 0..1."""
         self._fan_speed = speed
 
     def set_filament(self, mm_per_s: float, coming_mm_per_s: float | None = None) -> None:
-        """Take note how much filament has passed since the last measurement, and how much is going to.
+        """Set how fast filament has passed since the last measurement, and how fast it is going to.
 
         None: as much. What is pulled back takes no heat.
         """
@@ -114,7 +113,7 @@ class Mpc:
         self._coming_mm_per_s = max(coming, 0.0)
 
     def set_ambient(self, celsius: float) -> None:
-        """Take note of the temperature around, where a sensor tells it."""
+        """Set the ambient temperature, where a sensor measures it."""
         self._ambient_c = celsius
 
     # ----------------------------------------------------------------------------------------------- control
@@ -142,7 +141,7 @@ class Mpc:
         return abs(target_c - measured_c) <= NEAR_K and abs(self._slope.k_per_s) <= SLOW_K_PER_S
 
     def _flow_w(self, estimate: _Estimate, mm_per_s: float) -> float:
-        """Return the heat that comes to the block besides the heater's (negative: it loses).
+        """Return the heat that flows to the block in addition to the heater's (negative: it loses).
 
         MM_PER_S of filament pass.
         """
@@ -166,7 +165,7 @@ class Mpc:
         surprise = measured_c - estimate.sensor_c
         estimate.sensor_c += min(self._to_sensor * elapsed_s, 1.0) * surprise
         estimate.block_c += self._to_block * elapsed_s * surprise
-        # By what is measured: a model that is wrong thinks that it is not steady when it is.
+        # By the measurement: a wrong model would not see that the temperature is steady.
         full = self._power_w >= self._max_power * self.model.power_w
         if abs(self._slope.k_per_s) < self._steady_k_per_s and not full:
             most_w = UNEXPLAINED_PART * self.model.power_w
@@ -201,9 +200,3 @@ class Mpc:
     def unexplained_w(self) -> float:
         """Heat that the model does not explain, W."""
         return 0.0 if self._estimate is None else self._estimate.unexplained_w
-
-
-def fan_speeds(transfers: Sequence[float]) -> list[float]:
-    """Return the fan speeds that a list of losses stands for."""
-    count = len(transfers)
-    return [index / (count - 1) for index in range(count)] if count > 1 else [0.0] * count

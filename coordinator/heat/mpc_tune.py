@@ -2,7 +2,7 @@
 
 1. *rest*: the heater is off until its temperature stands still: that is what is around it.
 2. *heat*: at full power to the target. Capacity and responsiveness are those whose model fits the rise best.
-3. *hold*: at the target, with the fan at each of its speeds in turn, the power that holds it tells the loss.
+3. *hold*: at the target, with the fan at each of its speeds in turn, the power that holds it gives the loss.
 4. With the losses known the rise is fitted once more.
 """
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
-from coordinator.heat.mpc import HeaterModel, Mpc, fan_speeds
+from coordinator.heat.mpc import HeaterModel, Mpc
 from coordinator.heat.pid_tune import TuneError
 from coordinator.heat.rise import Rise, fit_rise
 
@@ -172,8 +172,3 @@ class MpcTune:
     def watched_c(self) -> float:
         """What the watch over the heater takes for its target; 0 while it is off."""
         return 0.0 if self.phase is TunePhase.REST else self.target_c
-
-    @property
-    def fan_speeds(self) -> list[float]:
-        """The speeds that were measured so far."""
-        return fan_speeds(self._transfers)

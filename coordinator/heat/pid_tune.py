@@ -99,8 +99,3 @@ class RelayTune:
     def watched_c(self) -> float:
         """What the watch over the heater takes for its target."""
         return self.target_c
-
-    @property
-    def swings(self) -> int:
-        """Whole swings so far."""
-        return max(len(self._swings) - 1, 0)

@@ -1,4 +1,4 @@
-"""Resistors that tell a temperature: NTC thermistors, platinum, tables. Both ways, °C to Ω and back.
+"""Resistors that measure a temperature: NTC thermistors, platinum, tables. Both ways, °C to Ω and back.
 
 Every function is total over positive resistances: beyond the range of the part it goes on as the formula
 does, so that a broken sensor reads as absurdly cold or hot and never as an exception.

@@ -62,7 +62,7 @@ class Fit:
 def fit_rise(rise: Rise, heat_w: float, ambient_c: float, *, transfer_w_per_k: float | None = None) -> Fit:
     """Return what explains a rise at HEAT_W.
 
-    Where the loss TRANSFER_W_PER_K is not known yet it is found too, as far as the rise tells it. Raises
+    Where the loss TRANSFER_W_PER_K is not known yet it is found too, as far as the rise shows it. Raises
     TuneError when nothing fits.
     """
     if len(rise.points) < MIN_POINTS:

@@ -1,7 +1,7 @@
-"""The watch over a heater, which has to heat as it is told to.
+"""The check that a heater heats as commanded.
 
 Three faults are found: it does not come nearer to a target (loose or broken heater, sensor fallen out), it
-does not hold one, and it goes on heating when it has been off for long (a switch that is stuck).
+does not hold one, and it still heats long after it was switched off (a switch that is stuck).
 """
 
 from dataclasses import dataclass
@@ -79,8 +79,8 @@ class HeaterCheck:
     def _begin(self, now_s: float, measured_c: float, target_c: float) -> None:
         """Take a new target: one above has to be approached, one below is reached.
 
-        What has not been reached yet goes on being watched from where it was: a program that changes the
-        target more often than the temperature is looked at must not put the watch off again and again.
+        A target that was not reached yet is checked from where its check began: a program that changes the
+        target more often than the temperature is measured must not put the check off again and again.
         """
         approaching = self._target_c > 0 and not self._reached
         self._target_c = target_c

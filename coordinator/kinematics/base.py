@@ -4,7 +4,6 @@ A *rail* is what one motor, or several side by side, move: an axis, a tower, an 
 what step generation divides by the way per step: mm, or rad where the rail turns.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -68,20 +67,6 @@ class WorkSpace:
     tower_rod: float = 0.0
     """Of a delta: length of its shortest rod, which lies flatter the further the head is out. 0: no delta."""
 
-    def contains(self, point: Point) -> bool:
-        """Return whether the head may be at POINT."""
-        radius = math.hypot(point[0], point[1])
-        x, y, z = point
-        inside = all(a <= p <= b for a, p, b in zip(self.low[:2], (x, y), self.high[:2], strict=True))
-        if not self.low[2] <= z <= self.high[2]:
-            inside = inside and self._in_cone(point)
-        return inside and radius >= self.radius_min and (radius <= self.max_radius or not self.max_radius)
-
-    def _in_cone(self, point: Point) -> bool:
-        x, y, z = point
-        down = math.hypot(self.cone_slope[0] * x, self.cone_slope[1] * y)
-        return any(self.cone_slope) and self.low[2] <= z <= self.cone_top - down
-
 
 class Kinematics(ABC):
     """Between the head and its rails. Subclasses are frozen values without any state."""
@@ -140,17 +125,3 @@ class Kinematics(ABC):
     @abstractmethod
     def forward(self, positions: tuple[float, ...]) -> Point:
         """Return where the head is when the rails are at POSITIONS; ValueError where they cannot be."""
-
-
-@dataclass(frozen=True, slots=True)
-class AxesKinematics(Kinematics):
-    """A kinematics with one rail per axis."""
-
-    box: WorkSpace
-    rails = ("x", "y", "z")
-    homing_order = (("x",), ("y",), ("z",))
-
-    @property
-    def work_space(self) -> WorkSpace:
-        """The box that the axes span."""
-        return self.box

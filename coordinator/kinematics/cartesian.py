@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from coordinator.kinematics.base import AxesKinematics, Point, StepFunction, linear
+from coordinator.kinematics.axes import AxesKinematics
+from coordinator.kinematics.base import linear
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,17 +12,5 @@ class Cartesian(AxesKinematics):
     """Three axes with motors of their own."""
 
     name = "cartesian"
+    functions = (linear(x=1), linear(y=1), linear(z=1))
     second_carriages: ClassVar = {"x": linear(x=1), "y": linear(y=1)}
-
-    def step_functions(self) -> tuple[StepFunction, ...]:
-        """Return the rails' functions."""
-        return (linear(x=1), linear(y=1), linear(z=1))
-
-    def inverse(self, point: Point) -> tuple[float, ...]:
-        """Return the rails' positions."""
-        return point
-
-    def forward(self, positions: tuple[float, ...]) -> Point:
-        """Return the head's place."""
-        x, y, z = positions
-        return (x, y, z)

@@ -7,7 +7,8 @@ that a motor alone moves its rail by the same way as on a cartesian machine.
 
 from dataclasses import dataclass
 
-from coordinator.kinematics.base import AxesKinematics, Point, StepFunction, linear
+from coordinator.kinematics.axes import AxesKinematics
+from coordinator.kinematics.base import linear
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,17 +16,4 @@ class CoreXY(AxesKinematics):
     """Rail x has the motor that moves by x + y, rail y the one that moves by x - y."""
 
     name = "corexy"
-
-    def step_functions(self) -> tuple[StepFunction, ...]:
-        """Return the rails' functions."""
-        return (linear(x=1, y=1), linear(x=1, y=-1), linear(z=1))
-
-    def inverse(self, point: Point) -> tuple[float, ...]:
-        """Return the rails' positions."""
-        x, y, z = point
-        return (x + y, x - y, z)
-
-    def forward(self, positions: tuple[float, ...]) -> Point:
-        """Return the head's place."""
-        a, b, c = positions
-        return ((a + b) / 2, (a - b) / 2, c)
+    functions = (linear(x=1, y=1), linear(x=1, y=-1), linear(z=1))

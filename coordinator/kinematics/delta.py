@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import spheres_meet
 
-USUAL_TOWER_SPEED = 3.0
-"""How much faster than the head a carriage may be: where a rod lies flatter, the head is slower instead."""
 MAX_TOWER_SPEED = 12.0
-"""How much faster it would be where the head may not go: it grows without bound as a rod lies down."""
+"""How much faster than the head a carriage would be where the head may not go.
+
+It grows without bound as a rod lies down; from 3 times on the planner has the head go slower."""
 _FLATTEST = math.sin(math.atan(MAX_TOWER_SPEED))
 """Share of a rod's length that is horizontal then: speed ratio = horizontal / vertical."""
 

@@ -7,7 +7,8 @@ Source: the way of a belt whose free length is x - y, as described for the Markf
 from dataclasses import dataclass
 from typing import ClassVar
 
-from coordinator.kinematics.base import AxesKinematics, Point, StepFunction, linear
+from coordinator.kinematics.axes import AxesKinematics
+from coordinator.kinematics.base import linear
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,19 +16,6 @@ class HybridCoreXY(AxesKinematics):
     """Rail x has the motor that moves by x - y; rail y moves y alone."""
 
     name = "hybrid_corexy"
+    functions = (linear(x=1, y=-1), linear(y=1), linear(z=1))
     second_carriages: ClassVar = {"x": linear(x=1, y=1)}
     """The second belt runs the other way round."""
-
-    def step_functions(self) -> tuple[StepFunction, ...]:
-        """Return the rails' functions."""
-        return (linear(x=1, y=-1), linear(y=1), linear(z=1))
-
-    def inverse(self, point: Point) -> tuple[float, ...]:
-        """Return the rails' positions."""
-        x, y, z = point
-        return (x - y, y, z)
-
-    def forward(self, positions: tuple[float, ...]) -> Point:
-        """Return the head's place."""
-        a, b, c = positions
-        return (a + b, b, c)

@@ -11,7 +11,7 @@ from coordinator.klippy_api.subscription import Status
 from coordinator.modules.base import Module
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.programs.gcode_macro import GCodeMacro
-from coordinator.modules.status.config_view import ConfigView
+from coordinator.modules.status.config_view import config_view
 from coordinator.modules.status.machine_view import available_kb
 from coordinator.modules.status.print_stats import NOTHING
 from coordinator.runtime.machine import Machine
@@ -49,7 +49,7 @@ class _Fixed:
 
     def __init__(self, machine: "Machine") -> None:
         modules = machine.modules
-        view = ConfigView(modules.config, modules.settings, {})
+        view = config_view(modules.config, modules.settings, {})
         described = machine.description
         warnings = [
             *({"type": "unsupported", "message": str(found)} for found in described.unsupported),

@@ -1,1 +1,1 @@
-"""What a machine has besides motion: heaters, fans, macros. One small file each; base.py is the seam."""
+"""Modules: everything but motion, such as heaters, fans and macros. base.py is their interface."""

@@ -1,4 +1,4 @@
-"""The seam between the machine and its modules.
+"""The interface between the machine and its modules.
 
 A section ``[heater_fan hotend]`` of the configuration becomes one object of a subclass of ``Module``:
 
@@ -8,7 +8,8 @@ A section ``[heater_fan hotend]`` of the configuration becomes one object of a s
 3. ``connect``: its nodes are configured and their clocks known; it may talk to them, and may fail.
 4. ``ready``: everything is connected. It must not fail.
 5. ``stopped``: a node or the host stopped the machine for safety; nodes have put their outputs to defaults.
-6. ``close``: it is over, whether it was ever connected or not.
+6. ``close``: the machine is closed, whether it was ever connected or not.
+   A module that stops acting in both cases overrides ``end``, which both of them call.
 
 A restart makes new modules: all state is in the object. Everything happens on the control loop, except that
 ``GCodeCommand.read`` runs where the program is read (coordinator/gcode/commands.py).
@@ -17,102 +18,93 @@ A restart makes new modules: all state is in the object. Everything happens on t
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from coordinator.config.errors import ConfigError, NotSupported, Place
+from coordinator.config.errors import NotSupported, Place
 from coordinator.config.file import RawSection
 from coordinator.config.model import MachineDescription
 from coordinator.config.options import BadValue, ListOption, Option, SectionReader, SectionSpec
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
-from coordinator.gcode.commands import GCodeCommand
+from coordinator.gcode.commands import Call, GCodeCommand, Reading
 from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.machine import Modules
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest, shown
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
+from nodes.support.errors import CanductorError
+
+__all__ = ["Build", "Device", "Module", "Modules"]
 
 
 class Device(Protocol):
-    """What a module has on a node: the host's side of one of its objects."""
+    """The host's side of an object on a node."""
 
     def configure(self, config: NodeConfig) -> None:
-        """Add it to what its node is configured as; raises NodeConfigError."""
+        """Add it to the configuration of its node; raises NodeConfigError."""
 
     def started(self, node: "Node") -> None:
-        """Its node is ready: at the start, and each time that it came back after it was lost."""
-
-
-class Modules(Protocol):
-    """The other modules of the machine."""
-
-    def find(self, name: str, kind: "type[M]") -> "M | None":
-        """Return the module of section NAME, or None when there is none of KIND."""
-
-    def names(self, kind: "type[Module]") -> list[str]:
-        """Return the section names of all modules of KIND, in the order of the file."""
-
-    def is_left_out(self, name: str) -> bool:
-        """Return whether NAME, a section or a heater of that name, is one that is not supported yet."""
-
-    def knows(self, command: str) -> bool:
-        """Return whether programs know COMMAND, by a module or anyway."""
-
-    @property
-    def command_help(self) -> "Mapping[str, str]":
-        """What each command of programs does, by its name: a sentence without a full stop."""
-
-    def status(self) -> "Mapping[str, Mapping[str, Value]]":
-        """Report how each module is, by its name; on the control loop."""
-
-    @property
-    def config(self) -> "Mapping[str, Mapping[str, str]]":
-        """The configuration as text: options by section."""
-
-    @property
-    def settings(self) -> "Mapping[str, Mapping[str, object]]":
-        """What was read of it: values and defaults."""
+        """Act on a node that is ready: at the start, and each time it comes back after it was lost."""
 
 
 class Module:
     """One section of the configuration."""
 
-    SPEC: ClassVar[SectionSpec]
-    """All its options; the reference page is made from it."""
+    KIND: ClassVar[str] = ""
+    """The first word of its sections; empty: it has none, or its package declares it as an entry point."""
+    SPEC: ClassVar[SectionSpec] = SectionSpec(help="", options=())
+    """All its options; the reference page is made from it. Modules without a section have none."""
     NAMED: ClassVar[bool] = False
     """Whether there may be several, ``[kind NAME]``; else there is one, ``[kind]``."""
     NAMELESS: ClassVar[bool] = False
     """Whether, where there may be several, one may be without a name."""
+    READS: ClassVar[str] = ""
+    """A pattern of section names: it reads further options of sections that the machine itself reads."""
     TITLE: ClassVar[str] = ""
-    """Which sections it reads a part of: ``[extruder], [extruder1] …``; else it has its own."""
+    """How these sections are shown: ``[extruder], [extruder1] …``."""
 
     def __init__(self, build: "Build") -> None:
         """Read all options; no I/O. Raises ConfigError."""
         self.name = build.name
         """The section's name: ``heater_fan hotend``."""
+        self._live: ModuleContext | None = None
+        """The running machine; None before ``connect``."""
 
     def link(self, modules: Modules) -> None:
         """Find other modules; raises ConfigError."""
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act; raises CanductorError when the hardware does not allow it."""
+    async def connect(self, live: ModuleContext) -> None:
+        """Start acting; raises CanductorError when the hardware does not allow it."""
+        self._live = live
+
+    @property
+    def live(self) -> ModuleContext:
+        """The running machine; raises CanductorError before ``connect``."""
+        if self._live is None:
+            raise CanductorError(f"[{self.name}] needs a machine that is connected")
+        return self._live
 
     def ready(self) -> None:
-        """Take note that the machine is ready."""
+        """Update its state: the machine is ready."""
 
     def job_begins(self) -> None:
-        """Take note that a service is about to print a file: what was known of the last one is void."""
+        """Forget what was known of the last job: a service is about to print a file."""
 
     def stopped(self, cause: str) -> None:
-        """Take note that the machine is stopped, and why."""
+        """Update its state: the machine was stopped because of CAUSE."""
+        self.end(cause)
 
     def close(self) -> None:
         """Release what it holds."""
+        self.end("the machine was closed")
+
+    def end(self, cause: str) -> None:
+        """Stop acting because of CAUSE; may be called more than once."""
 
     def status(self) -> Mapping[str, Value]:
-        """Report how it is: for macros and front ends; cheap, and not changed afterwards."""
+        """Return its status, for macros and front ends: quickly, and never changed afterwards."""
         return {}
 
     def stands_for(self) -> Mapping[str, set[str]]:
-        """Report which of its commands stand for lines of g-code, each with what may be commands in them."""
+        """Return the words of the g-code that its commands stand for, by command."""
         return {}
 
 
@@ -138,11 +130,11 @@ class Build:
         self.machine = machine
         """Nodes, steppers, rails, limits: what does not come from modules."""
         self.reader = SectionReader(section, spec, whole=whole)
-        self.devices: list[tuple[str, Device]] = []
-        """With the node of each."""
+        self.devices: list[tuple[str, Device, PinDescription | None]] = []
+        """With the node of each, and the pin that has to be checked there."""
         self.commands: list[GCodeCommand] = []
         self.replacements: list[tuple[GCodeCommand, str]] = []
-        """Commands that may take another's name, and the name that one has then; empty: there is no other."""
+        """Commands that may replace another one, and the new name of that one; empty: there is none."""
         self.set_ups: list[Callable[[Planner], None]] = []
         self.notes: list[str] = []
         self.unsupported = unsupported
@@ -195,23 +187,25 @@ class Build:
             raise NotSupported(self.place, f"it is for [{section}], which is not supported yet")
 
     def note(self, option: Option[Any], sentence: str) -> None:
-        """Report the user something about an option that is no mistake; SENTENCE goes on after its name."""
+        """Report something about an option that is no error; SENTENCE continues after the option's name."""
         self.notes.append(f"{self.reader.place_of(option)}: '{option.name}' of [{self.name}] {sentence}")
 
-    def add_device(self, node: str, device: Device) -> None:
-        """Have DEVICE on a node."""
-        self.devices.append((node, device))
+    def add_device(self, node: str, device: Device, pin: PinDescription | None = None) -> None:
+        """Add DEVICE to a node; if its firmware has no PIN, that is an error of the option that names it."""
+        self.devices.append((node, device, pin))
 
-    def add_command(self, command: GCodeCommand) -> None:
-        """Have programs know COMMAND."""
-        self.commands.append(command)
+    def add_command(
+        self, name: str, text: str, read: Callable[[Call], Reading], *, while_printing: bool = False
+    ) -> None:
+        """Add the command NAME to those of programs; arguments as in GCodeCommand, TEXT is its help."""
+        self.commands.append(GCodeCommand(name, text, read, while_printing=while_printing))
 
     def replace_command(self, command: GCodeCommand, rename: str = "") -> None:
-        """Have programs know COMMAND; one that had its name before is called RENAME then."""
+        """Add COMMAND to those of programs; one that had its name before is renamed to RENAME."""
         self.replacements.append((command, rename))
 
     def set_up_programs(self, call: "Callable[[Planner], None]") -> None:
-        """Have CALL called for every program that begins, in the reader's thread."""
+        """Call CALL for every program that begins, in the reader's thread."""
         self.set_ups.append(call)
 
     def shared(self, kind: type[M]) -> M:
@@ -234,12 +228,7 @@ class Build:
                     raise NotSupported(
                         self.reader.place_of(option), f"it needs [{name}], which is not supported yet"
                     )
-                others = modules.names(kind)
-                hint = nearest(name, others, pattern="[{}]") or f"; there is {', '.join(others) or 'none'}"
-                raise ConfigError(
-                    self.reader.place_of(option),
-                    f"'{option.name}' of [{self.name}] names {shown(name)}, which does not exist{hint}",
-                )
+                raise self.reader.unknown(option, name, modules.names(kind), "[{}]")
             return found
 
         return find

@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawSection
 from coordinator.config.model import MachineDescription, ModuleSection
-from coordinator.config.pins import PinRegistry
+from coordinator.config.pins import PinDescription, PinRegistry
 from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.gcode.absent_commands import ABSENT
 from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
@@ -102,7 +102,7 @@ class _LinkNotSupported(Exception):  # noqa: N818 (no mistake)
 
 @contextlib.contextmanager
 def _blamed(kind: type[Module], place: Place) -> Iterator[None]:
-    """Report the user whose module it was that raised what it must not; a bug of our own stays one."""
+    """Report which module of another package raised an unexpected exception; bugs of our own are raised."""
     try:
         yield
     except CanductorError:
@@ -120,7 +120,7 @@ def _blamed(kind: type[Module], place: Place) -> Iterator[None]:
 
 
 class ModuleSet:
-    """The modules, by the names of their sections; also what they are to each other."""
+    """The modules, by the names of their sections."""
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class ModuleSet:
         self._machine = machine
         self._modules: list[Module] = []
         self._places: dict[Module, Place] = {}
-        self._devices: dict[str, list[Device]] = {}
+        self._devices: dict[str, list[tuple[Device, PinDescription | None]]] = {}
         self._commands: dict[str, GCodeCommand] = {}
         self._owners: dict[str, str] = {}
         self._set_ups: list[Callable[[Planner], None]] = []
@@ -186,7 +186,7 @@ class ModuleSet:
             self.left_out[name] = LeftOut(name, source.section.place, source.kind, found.reason)
 
     def add_always(self) -> None:
-        """Make those that every machine has, with or without their sections."""
+        """Build the modules that every machine has, with or without their sections."""
         if self.find(IDLE_TIMEOUT, IdleTimeout) is None and IDLE_TIMEOUT not in self.left_out:
             section = RawSection(IDLE_TIMEOUT, Place("", 0))
             self.build(ModuleSource(section, IdleTimeout, whole=True))
@@ -207,14 +207,14 @@ class ModuleSet:
     def _add(self, module: Module, build: Build) -> None:
         self._modules.append(module)
         self._places[module] = build.place
-        for node, device in build.devices:
-            self._devices.setdefault(node, []).append(device)
+        for node, device, pin in build.devices:
+            self._devices.setdefault(node, []).append((device, pin))
         for command in build.commands:
             owner = self._owners.setdefault(command.name, build.name)
             if owner != build.name and command.name in self._commands:
                 raise ConfigError(
                     build.place,
-                    f"[{build.name}] brings the command {command.name}, which is {self._whose(owner)}; rename"
+                    f"[{build.name}] adds the command {command.name}, which is {self._whose(owner)}; rename"
                     " one",
                 )
             self._commands[command.name] = command
@@ -223,7 +223,7 @@ class ModuleSet:
         self._replacements += [(command, rename, build) for command, rename in build.replacements]
 
     def link(self) -> None:
-        """Let them find each other; raises ConfigError."""
+        """Link all modules; raises ConfigError."""
         for command, rename, build in self._replacements:
             self._replace(command, rename, build)
         for module in self._modules:
@@ -234,14 +234,14 @@ class ModuleSet:
                 raise _LinkNotSupported(module.name, error) from None
 
     def _replace(self, command: GCodeCommand, rename: str, build: Build) -> None:
-        """Let COMMAND have its name, and whoever had it before the name RENAME."""
+        """Add COMMAND; the command that had its name before is renamed to RENAME."""
         name = command.name
         before = self._commands.get(name)
         if not rename and name not in FREE_NAMES and (before is not None or name in BUILTIN_HELP):
             # What has no help does nothing by itself: M106 without a fan is a name that is free.
             section = build.reader.section
             if section.misspelt or "rename_existing" in section.set_aside:
-                return  # it is told already what is wrong with it
+                return  # what is wrong with it is reported already
             whose = self._whose(self._owners.get(name, ""))
             raise ConfigError(
                 build.place,
@@ -266,7 +266,7 @@ class ModuleSet:
         self._owners[name] = build.name
 
     def _whose(self, owner: str) -> str:
-        """Say whose a command is, of which OWNER is the module; what several sections share has none."""
+        """Return which section a command belongs to, of which OWNER is the module."""
         of_a_section = any(module.name == owner and self._places[module].path for module in self._modules)
         return f"that of [{owner}]" if of_a_section else "canductor's own"
 
@@ -345,7 +345,7 @@ class ModuleSet:
 
     def _too_cold(self, extruder: str) -> bool:
         if extruder in self.left_out:
-            return self._live is not None  # nobody knows how hot it is; a plan takes it for granted
+            return self._live is not None  # its temperature is unknown; a plan assumes that it is hot
         found = self.find(extruder, ExtruderHeaterSection)
         return found is not None and found.too_cold
 
@@ -356,14 +356,17 @@ class ModuleSet:
 
     def configure(self, config: NodeConfig) -> None:
         """Add all that is on a node to its CONFIG; raises CanductorError."""
-        for device in self._devices.get(config.name, ()):
+        known = config.dictionary.enumerations.get("pin")
+        for device, pin in self._devices.get(config.name, ()):
+            if pin is not None:
+                pin.number({} if known is None else known.values)  # raises ConfigError with file and line
             device.configure(config)
 
     # ---------------------------------------------------------------------------------------------- life
 
     def node_started(self, node: "Node") -> None:
-        """Take note that NODE is ready, for the first time or again."""
-        for device in self._devices.get(node.name, ()):
+        """Inform the devices of NODE, which is ready, for the first time or again."""
+        for device, _ in self._devices.get(node.name, ()):
             device.started(node)
 
     async def connect(self, machine: Machine, say: Callable[[str], None]) -> None:
@@ -379,7 +382,7 @@ class ModuleSet:
             module.ready()
 
     def job_begins(self) -> None:
-        """Report all that a file is going to be printed."""
+        """Inform all modules that a file is going to be printed."""
         for module in self._modules:
             module.job_begins()
 
@@ -388,7 +391,7 @@ class ModuleSet:
         self._motors.on(steppers)
 
     def stopped(self, cause: str) -> None:
-        """Report all that the machine is stopped."""
+        """Inform all modules that the machine is stopped."""
         if self._live is not None:
             for module in self._modules:
                 module.stopped(cause)
@@ -403,5 +406,5 @@ class ModuleSet:
         self._live = None
 
     def status(self) -> Mapping[str, Mapping[str, Value]]:
-        """Report how each is, by the name of its section."""
+        """Return the status of each module, by the name of its section."""
         return {module.name: status for module in self._modules if (status := module.status())}

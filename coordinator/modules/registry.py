@@ -1,80 +1,40 @@
-"""Which module a section is for. Third parties add theirs by the entry point group ``canductor.modules``."""
+"""Which module a section is for: the one whose ``KIND`` is the section's first word.
+
+Modules of this package are found in its folders, those of other packages by the entry point group
+``canductor.modules``.
+"""
 
 import re
 from collections.abc import Iterator
 from functools import cache
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pkgutil import iter_modules
 from typing import Final
 
+import coordinator.modules
 from coordinator.config.errors import ConfigError, Place
 from coordinator.modules.base import Module
-from coordinator.modules.drivers.tmc_driver import Tmc2208, Tmc2209
-from coordinator.modules.fans.automatic_fans import ControllerFan, HeaterFan
-from coordinator.modules.fans.fans import Fan, FanGeneric
-from coordinator.modules.fans.temperature_fan import TemperatureFan
-from coordinator.modules.heaters.pid_profile import PidProfile
-from coordinator.modules.heaters.sections import ExtruderHeaterSection, HeaterBed, HeaterGeneric
-from coordinator.modules.heaters.verify_heater import VerifyHeater
-from coordinator.modules.homing.homing_override import HomingOverride
-from coordinator.modules.homing.safe_z_home import SafeZHome
-from coordinator.modules.levelling.skew_correction import SkewCorrection
-from coordinator.modules.motion.firmware_retraction import FirmwareRetraction
-from coordinator.modules.motion.force_move import ForceMove
-from coordinator.modules.motion.gcode_arcs import GCodeArcs
-from coordinator.modules.outputs.output_pin import OutputPin, StaticDigitalOutput
-from coordinator.modules.programs.delayed_gcode import DelayedGCode
-from coordinator.modules.programs.exclude_object import ExcludeObject
-from coordinator.modules.programs.gcode_macro import GCodeMacro
-from coordinator.modules.programs.idle_timeout import IdleTimeout
-from coordinator.modules.programs.pause_resume import PauseResume
-from coordinator.modules.programs.save_variables import SaveVariables
-from coordinator.modules.programs.virtual_sdcard import VirtualSdcard
-from coordinator.modules.sensors.filament_switch_sensor import FilamentSwitchSensor
-from coordinator.modules.sensors.gcode_button import GCodeButton
-from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
-from coordinator.modules.sensors.thermistor import AdcTemperature, Thermistor
-from coordinator.modules.status.display_status import DisplayStatus
-from coordinator.modules.status.respond import Respond
 
 ENTRY_POINTS: Final = "canductor.modules"
 """Name: the section's first word; value: ``package.module:Class``."""
-MODULES: Final[dict[str, type[Module]]] = {
-    "adc_temperature": AdcTemperature,
-    "controller_fan": ControllerFan,
-    "delayed_gcode": DelayedGCode,
-    "display_status": DisplayStatus,
-    "exclude_object": ExcludeObject,
-    "fan": Fan,
-    "fan_generic": FanGeneric,
-    "filament_switch_sensor": FilamentSwitchSensor,
-    "firmware_retraction": FirmwareRetraction,
-    "force_move": ForceMove,
-    "gcode_arcs": GCodeArcs,
-    "gcode_button": GCodeButton,
-    "gcode_macro": GCodeMacro,
-    "heater_bed": HeaterBed,
-    "heater_fan": HeaterFan,
-    "heater_generic": HeaterGeneric,
-    "homing_override": HomingOverride,
-    "idle_timeout": IdleTimeout,
-    "output_pin": OutputPin,
-    "pause_resume": PauseResume,
-    "pid_profile": PidProfile,
-    "respond": Respond,
-    "safe_z_home": SafeZHome,
-    "save_variables": SaveVariables,
-    "skew_correction": SkewCorrection,
-    "static_digital_output": StaticDigitalOutput,
-    "temperature_fan": TemperatureFan,
-    "temperature_sensor": TemperatureSensor,
-    "tmc2208": Tmc2208,
-    "tmc2209": Tmc2209,
-    "thermistor": Thermistor,
-    "verify_heater": VerifyHeater,
-    "virtual_sdcard": VirtualSdcard,
-}
+
+
+def _own_classes() -> Iterator[type[Module]]:
+    """Yield all modules in the folders of this package."""
+    for folder in iter_modules(coordinator.modules.__path__, f"{coordinator.modules.__name__}."):
+        if not folder.ispkg:
+            continue
+        for file in iter_modules(import_module(folder.name).__path__, f"{folder.name}."):
+            for found in vars(import_module(file.name)).values():
+                if isinstance(found, type) and issubclass(found, Module) and found.__module__ == file.name:
+                    yield found
+
+
+_OWN: Final = sorted(_own_classes(), key=lambda module: module.KIND)
+MODULES: Final = {module.KIND: module for module in _OWN if "KIND" in vars(module)}
 """Our modules, by the section's first word."""
-_OPTION_READERS: Final[dict[str, type[Module]]] = {r"extruder[0-9]*": ExtruderHeaterSection}
+_OPTION_READERS: Final = {module.READS: module for module in _OWN if module.READS}
 """By a pattern of section names that the machine itself reads: which module reads further options there."""
 
 

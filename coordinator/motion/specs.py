@@ -1,4 +1,4 @@
-"""What motion is told about the machine: plain values, checked by whoever builds them."""
+"""What motion needs to know about the machine: plain values, checked by their builder."""
 
 from dataclasses import dataclass
 

@@ -47,7 +47,7 @@ def plan_file(options: PlanOptions) -> PlanReport:
     """Plan OPTIONS.gcode for OPTIONS.config; raises CanductorError."""
     description = load_machine(str(options.config))
     modules = build_modules(description)
-    devices = MachineDevices(description, modules)
+    devices = MachineDevices(description, modules.configure)
     dictionaries = _dictionaries(description, options)
     for node in description.nodes:
         devices.build_config(node.name, dictionaries[node.name])

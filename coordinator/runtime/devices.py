@@ -1,7 +1,6 @@
 """The configured machine's devices: what each node is configured as, and what motion has to know of it."""
 
-from collections.abc import Iterable, Mapping
-from typing import Protocol
+from collections.abc import Callable, Iterable, Mapping
 
 from coordinator.config.model import (
     CanConnection,
@@ -20,22 +19,19 @@ from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
 from nodes.node.config import NodeConfig
 
 
-class ConfiguresNodes(Protocol):
-    """Adds to the configuration of nodes."""
-
-    def configure(self, config: NodeConfig) -> None:
-        """Add to CONFIG what its node needs."""
-
-
 class MachineDevices:
-    """The steppers and endstops of a machine and what its MODULES have; of the real and the offline one.
+    """The steppers and endstops of a machine and the devices of its modules; of the real and the offline one.
+
+    CONFIGURE_MODULES adds to a node's configuration what modules have on that node.
 
     Call ``build_config`` for every node with its dictionary first; the specs are known afterwards.
     """
 
-    def __init__(self, description: MachineDescription, modules: ConfiguresNodes) -> None:
+    def __init__(
+        self, description: MachineDescription, configure_modules: Callable[[NodeConfig], None]
+    ) -> None:
         self.description = description
-        self.modules = modules
+        self._configure_modules = configure_modules
         self.steppers: dict[str, Stepper] = {s.name: _stepper(s) for s in description.steppers}
         self.endstops: dict[str, Endstop] = {rail.axis: _endstop(rail) for rail in description.stops}
         """By the name of the rail, or of the piece of one, that it stops."""
@@ -65,7 +61,7 @@ class MachineDevices:
         for tables in self.tables:
             if tables.node == node:
                 tables.configure(config)
-        self.modules.configure(config)
+        self._configure_modules(config)
         self._spread_shutdown(config)
         return config
 
@@ -95,7 +91,7 @@ class MachineDevices:
         return rail.homing.endstop_pin.node
 
     def _spread_shutdown(self, config: NodeConfig) -> None:
-        """Have a node that must not fail stop its whole bus when it shuts down, past the host."""
+        """Make a node with policy fatal stop its whole bus when it shuts down, without the host."""
         described = next(n for n in self.description.nodes if n.name == config.name)
         knows = config.dictionary.int_constant(KNOWS_BUS_STOP, 0)
         on_can = isinstance(described.connection, CanConnection)

@@ -44,7 +44,7 @@ class FilamentForecast:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether somebody asks."""
+        """Whether any heater uses the forecast."""
         return bool(self._tracks)
 
     def want(self, extruder: str) -> None:

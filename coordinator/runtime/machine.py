@@ -58,8 +58,8 @@ class _OpenBus:
     watch: BusOverloadDetector
 
 
-class MachineModules(Protocol):
-    """All modules of one machine; ``coordinator/modules/module_set.py`` provides it."""
+class Modules(Protocol):
+    """All modules of one machine; ``coordinator/modules/module_set.py`` implements it."""
 
     config: Mapping[str, Mapping[str, str]]
     """The configuration as text: options by section."""
@@ -85,6 +85,7 @@ class MachineModules(Protocol):
     def names(self, kind: type[Any]) -> list[str]: ...  # noqa: D102
     def find(self, name: str, kind: type[M]) -> M | None: ...  # noqa: D102
     def of(self, kind: type[M]) -> Iterator[M]: ...  # noqa: D102
+    def is_left_out(self, name: str) -> bool: ...  # noqa: D102
 
 
 def _ignore(_: str) -> None:
@@ -108,7 +109,7 @@ class Machine:
         self,
         description: MachineDescription,
         host: Host,
-        modules: MachineModules,
+        modules: Modules,
         *,
         on_notice: Callable[[str], None] = _ignore,
         cache: DictionaryCache | None = None,
@@ -119,7 +120,7 @@ class Machine:
         self.host = host
         self.policies = {node.name: node.policy for node in description.nodes}
         self.modules = modules
-        self.devices = MachineDevices(description, self.modules)
+        self.devices = MachineDevices(description, modules.configure)
         self.stepper_positions = StepperPositions(description)
         self.nodes: dict[str, Node] = {}
         self.stopped: MachineStopped | None = None

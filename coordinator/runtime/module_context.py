@@ -10,7 +10,7 @@ from nodes.clock.clock import Ticks, extend32
 from nodes.node.node import Node
 
 AHEAD_S: Final = 0.1
-"""What is to happen as soon as possible happens so far ahead of now: commands need their time to the node."""
+"""How far ahead of now the earliest commands are timed: they need their time to the node."""
 
 
 class ModuleContext:
@@ -52,7 +52,7 @@ class ModuleContext:
         return self._time_base.print_time_at(clock.ns_at(ticks))
 
     def soon_on_loop(self, call: Callable[[], None]) -> None:
-        """Have CALL called on the control loop; from any thread."""
+        """Call CALL on the control loop; from any thread."""
         with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(call)
 
@@ -63,13 +63,13 @@ class ModuleContext:
         return timer.end
 
     def after(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
-        """Call CALL once after so many seconds; returns what calls it off."""
+        """Call CALL once after so many seconds; returns what cancels it."""
         timer = _Timer(seconds, call, again=False, ended=self._timers.discard)
         self._timers.add(timer)
         return timer.end
 
     def save(self, section: str, option: str, text: str) -> None:
-        """Have SAVE_CONFIG write a value that was calibrated; raises SaveError for a text that it cannot."""
+        """Save a calibrated value with the next SAVE_CONFIG; raises SaveError for text it cannot write."""
         self.machine.unsaved.put(section, option, text)
 
     def stop(self, cause: str) -> None:
@@ -96,7 +96,7 @@ class _Timer:
 
     def _fire(self) -> None:
         if self._again:
-            # Missed turns are not made up for: the loop was busy, or the machine slept.
+            # Missed calls are not repeated: the loop was busy, or the machine slept.
             self._due_s = max(self._due_s + self._seconds, self._loop.time())
             self._handle = self._loop.call_at(self._due_s, self._fire)
         else:

@@ -1,11 +1,11 @@
-"""What modules may have a service do. Without one (a file is run, a program is planned) there is none."""
+"""What a service does for modules. There is none where a file is run or a program is planned."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 
 class Runner(Protocol):
-    """Has the machine do things on its own account; on the control loop."""
+    """Runs g-code for modules; on the control loop."""
 
     @property
     def busy(self) -> bool:
@@ -18,7 +18,7 @@ class Runner(Protocol):
         ...
 
     def run_lines(self, name: str, lines: Sequence[str], text: str = "") -> None:
-        """Have g-code LINES done as those of a client; NAME is for messages. What goes wrong is logged.
+        """Run g-code LINES as those of a client; NAME is for messages. Errors are logged.
 
         TEXT is what they stand for: a job is paused first if there are words in it that pause or cancel one.
         """
@@ -29,10 +29,10 @@ class Runner(Protocol):
         ...
 
     def call_remote(self, name: str, values: Mapping[str, object]) -> None:
-        """Have every client that registered the method NAME called with VALUES."""
+        """Call every client that registered the method NAME, with VALUES."""
 
     def run_paused(self, name: str, lines: Sequence[str], *, stay: bool) -> None:
-        """Have LINES done with the job paused, if there is one: they may move.
+        """Run LINES with the job paused, if there is one: they may move.
 
-        It goes on behind them, unless they have paused it; with STAY it stays paused.
+        The job resumes after them, unless they have paused it; with STAY it stays paused.
         """

@@ -19,10 +19,10 @@ class PausableJob(Protocol):
     """A job that can be made to wait."""
 
     def hold(self, cause: str) -> None:
-        """Let the job come to a standstill; CAUSE is a sentence."""
+        """Bring the job to a standstill; CAUSE is a sentence."""
 
     def release(self) -> None:
-        """Let the job go on; without effect on one that is not held."""
+        """Resume the job; no effect on one that is not held."""
 
 
 class NodeRecovery:
@@ -54,7 +54,7 @@ class NodeRecovery:
         return tuple(self._out)
 
     def begin_job(self, gate: PausableJob) -> None:
-        """Have GATE held whenever a node with policy pause is out."""
+        """Hold GATE whenever a node with policy pause is absent."""
         self._gate = gate
         for name in self._out:
             self._hold_for(name, f"node {name} is not there")

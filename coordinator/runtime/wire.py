@@ -20,7 +20,7 @@ class Wire:
         return self._port.start_io(on_frame=on_frame, on_closed=on_closed)
 
     def close(self) -> None:
-        """Let go of the port, after its I/O has ended."""
+        """Release the port, after its I/O has ended."""
         port, self._port = self._port, None
         if port is not None:
             port.close()

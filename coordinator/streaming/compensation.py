@@ -54,7 +54,7 @@ class Compensation:
         self.states: Mapping[str, AxisState] = {}
 
     def want(self, axis: str, table: AxisTable | None) -> None:
-        """Have TABLE taken up on AXIS (a letter), or its table removed, as soon as that may be."""
+        """Take TABLE up on AXIS (a letter), or remove its table, as soon as that is possible."""
         others = {name: kept for name, kept in self.wanted.items() if name != axis}
         self.wanted = others if table is None else {**others, axis: table}
 
@@ -97,9 +97,9 @@ class Compensation:
         self._looked_at = ({}, "")
 
     def declared(self, steps: StepGenerator, before: tuple[AxisCorrection, ...], homed: str) -> None:
-        """Let axes that were not just HOMED (capital letters) keep what was added to them.
+        """Keep the corrections of axes that were not just HOMED (capital letters).
 
-        STEPS were told where the machine stands; BEFORE is what was added until then.
+        The position of STEPS was set; BEFORE are the corrections until then.
         """
         kept, self._carried = self._carried or before, None
         if any(correction.offset_mm for correction in kept):

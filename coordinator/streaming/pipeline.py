@@ -185,7 +185,7 @@ class Pipeline:
         self.planner.begin_at(self.steps.next_move_s)
 
     def _begin(self) -> None:
-        """Let step generation begin as the job's machine is."""
+        """Set step generation up for the state of the job's machine."""
         machine = self.job.machine
         for axis, shaper in machine.shapers.items():
             self._shape(axis, shaper)

@@ -2,7 +2,6 @@
 
 from coordinator.config.model import MachineDescription
 from coordinator.gcode.machine_state import Extruder, MachineState, Shaper
-from coordinator.kinematics.extruder import ExtruderMotion
 
 
 def machine_state(description: MachineDescription) -> MachineState:
@@ -13,15 +12,10 @@ def machine_state(description: MachineDescription) -> MachineState:
         )
         for extruder in description.extruders
     }
-    motion = None
-    if extruders:
-        followed = {extruder.stepper.name: extruder.name for extruder in description.extruders}
-        followed |= {follower.stepper.name: follower.extruder for follower in description.extruder_steppers}
-        motion = ExtruderMotion(tuple(extruders), description.extruders[0].name, followed)
     dual = description.dual_carriage
     return MachineState(
         extruders,
-        motion,
+        description.extruder_motion if extruders else None,
         dual.carriages if dual else None,
         dual.carriages.home if dual else None,
         {s.axis.upper(): Shaper(s.kind, s.frequency_hz, s.damping_ratio) for s in description.shapers},

@@ -19,8 +19,8 @@ class StandstillTask:
     def look(self) -> bool:
         """Cancel it if its event was cancelled; return whether it is over; the event has the result.
 
-        Raises what performing it raised, but for a CanductorError, which the program gets. Whoever failed or
-        was ended on the way may have moved something.
+        Raises what performing it raised, but for a CanductorError, which the program gets. An action that
+        failed or was cancelled may have moved something.
         """
         if self._event.cancelled and not self._is_ending:
             self._is_ending = True  # asked once: a second time would interrupt its tidying up
@@ -41,7 +41,7 @@ class StandstillTask:
         return True
 
     async def close(self) -> None:
-        """End it, whatever becomes of it."""
+        """Cancel it and wait for its end."""
         self._task.cancel()
         with contextlib.suppress(asyncio.CancelledError, CanductorError):
             await self._task

@@ -25,7 +25,7 @@ BUSY_START_LEAD_S: Final = 0.6
 BUSY_LOAD: Final = 0.3
 """Share of a bus's time from which it counts as busy."""
 SETTLE_S: Final = 0.05
-"""After the last step is due, before it is believed to be done."""
+"""After the last step is due, before it counts as done."""
 CAUSE_WAIT_S: Final = 0.1
 
 
@@ -74,14 +74,14 @@ class Streamer:
         return max(0.0, min(now, self.worker.pipeline.appended_until) - self.began_s)
 
     def hold(self, cause: str) -> None:
-        """Let the g-code wait, from the control loop: what is planned is carried out, to a standstill.
+        """Hold the g-code, from the control loop: what is planned is carried out, to a standstill.
 
         CAUSE is a sentence. The end of a job that has been read to its end is not held up.
         """
         self.worker.held = cause
 
     def release(self) -> None:
-        """Let the g-code go on after ``hold``."""
+        """Resume the g-code after ``hold``."""
         self.worker.held = None
 
     @property
@@ -149,7 +149,7 @@ class Streamer:
             await self._settle(thread)
 
     async def _attend(self, event: StandstillAction) -> None:
-        """Have EVENT performed once all moves before it are executed."""
+        """Perform EVENT once all moves before it are executed."""
         if self._standstill is None:
             if self.print_time_now() < event.print_time_s + self.worker.steps.lag_s + SETTLE_S:
                 return
@@ -177,8 +177,8 @@ class Streamer:
         self._look_at_load()
 
     def _report_output(self, cycle: Cycle) -> None:
-        for told in cycle.output:
-            self._on_output(told)
+        for output in cycle.output:
+            self._on_output(output)
         self._act(self._due.take(self.print_time_now(), cycle.due))
 
     async def _report_cycle(self, cycle: Cycle) -> None:

@@ -136,7 +136,7 @@ class MotionWorker:
     # ---------------------------------------------------------------------------- in the worker's thread
 
     def work(self, waiting_for: Event | None) -> Cycle:
-        """Let the job go on as far as it should by now, and make the commands that are due."""
+        """Run the job as far as it should be by now, and make the commands that are due."""
         now = self.print_time_now()
         output: list[ProgramOutput] = []
         event = waiting_for

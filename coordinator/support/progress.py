@@ -80,7 +80,7 @@ def summary(progress: Progress) -> str:
 
 
 class ProgressDisplay:
-    """Context manager that draws what ``update`` is told.
+    """Context manager that draws the progress given to ``update``.
 
     On a terminal: a live table on stdout, redrawn at most five times a second, left standing at the end.
     With quiet (for --json) or without a terminal: one line on stderr at most every five seconds.

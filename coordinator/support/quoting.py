@@ -16,7 +16,7 @@ def shown(text: str) -> str:
 
 
 def shown_path(path: str) -> str:
-    """Quote a path; of a long one the end is what tells."""
+    """Quote a path; of a long one the end is shown."""
     line = "".join(c if c.isprintable() else "?" for c in path)
     return f"'{line}'" if len(line) <= _SHOWN_PATH_CHARS else f"'…{line[-_SHOWN_PATH_CHARS:]}'"
 
@@ -28,3 +28,9 @@ def nearest(word: str, valid: Iterable[str], *, pattern: str = "{}") -> str:
     lower = {name.lower(): name for name in valid}
     found = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
     return f"; did you mean {pattern.format(lower[found[0]])}?" if found else ""
+
+
+def nearest_or_all(word: str, valid: Iterable[str], *, pattern: str = "{}") -> str:
+    """Return the valid name that looks like the word as ``nearest`` does, else all of them."""
+    names = tuple(valid)
+    return nearest(word, names, pattern=pattern) or f"; there is {', '.join(names) or 'none'}"

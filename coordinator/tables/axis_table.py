@@ -25,6 +25,10 @@ SLOPE_MAX: Final = 0.02
 CORRECTION_MAX: Final = 5.0
 
 
+Point = tuple[float, float, float]
+"""A position, and the corrections there for travel forward and in reverse."""
+
+
 class TableError(CanductorError):
     """A table that no axis can have; one sentence, with file and line where it comes from one."""
 
@@ -66,10 +70,11 @@ class AxisTable:
                 f"the table of axis {self.axis} has {count} positions, {len(self.forward)} forward and "
                 f"{len(self.reverse)} reverse corrections; give {POINTS[0]} to {POINTS[-1]} of each, as many"
             )
-        for number in range(count):
-            problem = problem_at(self, number)
-            if problem:
-                raise TableError(f"the table of axis {self.axis}, point {number + 1}: {problem}")
+        before = None
+        for number, point in enumerate(zip(self.positions, self.forward, self.reverse, strict=True), 1):
+            if problem := problem_of(self.unit, point, before):
+                raise TableError(f"the table of axis {self.axis}, point {number}: {problem}")
+            before = point
 
     def corrections(self, direction: Direction) -> tuple[float, ...]:
         """Return the corrections for travel in DIRECTION."""
@@ -99,15 +104,14 @@ class AxisTable:
         return self.forward == self.reverse
 
 
-def problem_at(table: AxisTable, number: int) -> str:
-    """Return what is wrong with point NUMBER (from 0) as it follows the one before; empty: nothing."""
-    return _bad_values(table, number) or (_bad_step(table, number) if number else "")
+def problem_of(unit: Unit, point: Point, before: Point | None) -> str:
+    """Return what is wrong with a POINT of a table as it follows the one BEFORE; empty: nothing."""
+    return _bad_values(unit, point) or ("" if before is None else _bad_step(unit, point, before))
 
 
-def _bad_values(table: AxisTable, number: int) -> str:
-    x, unit = table.positions[number], table.unit
-    values = (table.forward[number], table.reverse[number])
-    if not all(map(math.isfinite, (x, *values))):
+def _bad_values(unit: Unit, point: Point) -> str:
+    x, *values = point
+    if not all(map(math.isfinite, point)):
         return "a value is not finite; give numbers"
     if abs(x) * X_PER_UNIT > VALUES[-1]:
         return f"the position {x:g} {unit} is beyond {VALUES[-1] / X_PER_UNIT:g} {unit}; check the unit"
@@ -120,18 +124,18 @@ def _bad_values(table: AxisTable, number: int) -> str:
     return ""
 
 
-def _bad_step(table: AxisTable, number: int) -> str:
-    x, before, unit = table.positions[number], table.positions[number - 1], table.unit
-    if round(x * X_PER_UNIT) <= round(before * X_PER_UNIT):
+def _bad_step(unit: Unit, point: Point, before: Point) -> str:
+    x, x0 = point[0], before[0]
+    if round(x * X_PER_UNIT) <= round(x0 * X_PER_UNIT):
         return (
-            f"the position {x:g} {unit} follows {before:g} {unit}; positions must ascend by at least"
+            f"the position {x:g} {unit} follows {x0:g} {unit}; positions must ascend by at least"
             f" {1 / X_PER_UNIT:g} {unit}"
         )
-    for word, side in (("forward", table.forward), ("reverse", table.reverse)):
-        slope = (side[number] - side[number - 1]) / (x - before)
+    for side, value, value0 in zip(Direction, point[1:], before[1:], strict=True):
+        slope = (value - value0) / (x - x0)
         if abs(slope) > SLOPE_MAX:
             return (
-                f"the {word} correction changes by {slope:.3g} {unit} per {unit}, more than {SLOPE_MAX:g}; a"
+                f"the {side} correction changes by {slope:.3g} {unit} per {unit}, more than {SLOPE_MAX:g}; a"
                 " screw does not: check the unit, and this point"
             )
     return ""
@@ -151,11 +155,11 @@ def notes(table: AxisTable, low: float | None, high: float | None) -> list[str]:
             f"from {low:g} to {high:g} {table.unit}; check the unit and the axis"
         )
     if first > low or last < high:
-        told = (
+        note = (
             f"axis {table.axis} travels from {low:g} to {high:g} {table.unit}, the table covers {first:g} to "
             f"{last:g}; beyond it the corrections at its ends hold"
         )
-        return [told]
+        return [note]
     return []
 
 

@@ -1,7 +1,6 @@
 """Reads axis tables from files: LinuxCNC's COMP_FILE of both types, and CSV with units in its header."""
 
 import csv
-import itertools
 import math
 import re
 import stat
@@ -9,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from coordinator.tables.axis_table import POINTS, AxisTable, TableError, Unit, problem_at
+from coordinator.tables.axis_table import POINTS, AxisTable, TableError, Unit, problem_of
 
 FILE_BYTES_MAX: Final = 4_000_000
 LENGTHS: Final = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "inch": 25.4}
@@ -159,26 +158,14 @@ def _columns(path: Path, line: int, cells: list[str]) -> dict[str, tuple[int, st
 
 
 def _checked(path: Path, axis: str, kind: Unit, points: list[_Point]) -> AxisTable:
-    """Return the table; what is wrong with a point is told with its line."""
+    """Return the table; errors of a point name its line."""
     if len(points) not in POINTS:
         raise TableError(f"{path}: {len(points)} points; a table has {POINTS[0]} to {POINTS[-1]}")
-    for (before, *first), (line, *second) in itertools.pairwise(points):
-        two = _unchecked(axis, kind, [first, second])
-        for number, at in ((0, before), (1, line)):
-            if problem := problem_at(two, number):
-                raise TableError(f"{path}:{at}: {problem}")
-    return _table(axis, kind, [values for _, *values in points])
-
-
-def _table(axis: str, kind: Unit, points: list[list[float]]) -> AxisTable:
-    positions, forward, reverse = (tuple(values) for values in zip(*points, strict=True))
+    before = None
+    for line, *values in points:
+        point = (values[0], values[1], values[2])
+        if problem := problem_of(kind, point, before):
+            raise TableError(f"{path}:{line}: {problem}")
+        before = point
+    _, positions, forward, reverse = zip(*points, strict=True)
     return AxisTable(axis=axis, unit=kind, positions=positions, forward=forward, reverse=reverse)
-
-
-def _unchecked(axis: str, kind: Unit, points: list[list[float]]) -> "AxisTable":
-    """Return the fields of a table without its check."""
-    table = object.__new__(AxisTable)
-    columns = dict(zip(("positions", "forward", "reverse"), zip(*points, strict=True), strict=True))
-    for name, value in {"axis": axis, "unit": kind, **columns}.items():
-        object.__setattr__(table, name, value)
-    return table

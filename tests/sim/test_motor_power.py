@@ -76,9 +76,9 @@ def test_a_driver_that_was_switched_off_stays_so_while_others_move(tmp_path: Pat
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("SET_STEPPER_ENABLE STEPPER=stepper_q", "motors with enable pins: stepper_x stepper_y stepper_z"),
-        ("SET_STEPPER_ENABLE STEPPER=stepper_x ENABLE=2", "it must be 0 or 1"),
-        ("STEPPER_BUZZ STEPPER=stepper_q", "there are stepper_x stepper_y stepper_z"),
+        ("SET_STEPPER_ENABLE STEPPER=q", "no 'q'; there is stepper_x, stepper_y, stepper_z"),
+        ("SET_STEPPER_ENABLE STEPPER=stepper_x ENABLE=2", "give 0 or 1"),
+        ("STEPPER_BUZZ STEPPER=stepper_q", "there is no 'stepper_q'; did you mean stepper_z?"),
     ],
 )
 def test_bad_parameters_end_the_program_with_the_line(tmp_path: Path, line: str, sentence: str) -> None:

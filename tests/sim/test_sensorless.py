@@ -226,5 +226,5 @@ def test_a_driver_that_falls_silent_while_an_axis_homes(tmp_path: Path) -> None:
 
 def test_one_that_feels_nothing_at_that_speed(tmp_path: Path) -> None:
     text = SENSORLESS_CFG.replace("hold_current: 0.5\n", "coolstep_threshold: 41\n")
-    with pytest.raises(GCodeError, match=r"^part\.gcode:1: .* cannot feel the end of the axis at 40 mm/s"):
+    with pytest.raises(GCodeError, match=r"^part\.gcode:1: .* cannot detect the end of the axis at 40 mm/s"):
         Printer(tmp_path, machine=text).print("G28 X")

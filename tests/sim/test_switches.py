@@ -95,7 +95,7 @@ def test_a_job_that_runs_out_of_filament_pauses_and_parks(tmp_path: Path) -> Non
         put(printer, "runout", there=False)
         await stage.until_job("paused")
         await stage.until(lambda: told(stage, "echo: False") == 1, "runout_gcode")
-        assert told(stage, "filament_switch_sensor runout: there is no filament any more")
+        assert told(stage, "filament_switch_sensor runout: the filament has run out")
         assert stage.planned[:3] == pytest.approx((10, 10, 6))
         put(printer, "runout", there=True)
         await stage.until(lambda: filament(printer, "runout"), "filament")

@@ -13,11 +13,11 @@ from coordinator.ipc.protocol.methods import Caller, Registry, Scope
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.uploads import upload_method
 from coordinator.motion.planner.planner import Position
-from coordinator.motion.steps.steps import resting_step
 from coordinator.runtime.host import Host
 from coordinator.service.api.methods import add_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.state.log_ring import Entry
+from tests.stages.resting_step import resting_step
 
 LIMIT_S = 60.0
 """Nothing here may take longer, in virtual time."""

@@ -1,8 +1,10 @@
-"""The highest values that the configuration accepts.
+"""The highest values that the configuration accepts, and options that are bounded by them alone.
 
 They are far above any machine, and low enough that squares and sums stay exact and a slipped digit group is
 noticed.
 """
+
+from coordinator.config.options import FloatOption
 
 MAX_SPEED = 100_000.0
 """mm/s."""
@@ -12,3 +14,25 @@ MAX_POSITION = 100_000.0
 """mm: a hundred metres; positions stay exact to far below a step."""
 MAX_BELT_POSITION = 1e9
 """mm: the end of an axis that has none, of a machine with a belt for its bed."""
+
+
+def speed_option(name: str, text: str, default: float | None = None) -> FloatOption:
+    """Return the option NAME for a speed above 0; TEXT is its help."""
+    return FloatOption(name=name, help=text, default=default, unit="mm/s", above=0, maximum=MAX_SPEED)
+
+
+def accel_option(name: str, text: str, default: float | None = None) -> FloatOption:
+    """Return the option NAME for an acceleration above 0; TEXT is its help."""
+    return FloatOption(name=name, help=text, default=default, unit="mm/s²", above=0, maximum=MAX_ACCEL)
+
+
+def length_option(name: str, text: str) -> FloatOption:
+    """Return the option NAME for a length above 0; TEXT is its help."""
+    return FloatOption(name=name, help=text, unit="mm", above=0, maximum=MAX_POSITION)
+
+
+def position_option(name: str, text: str, default: float | None = None) -> FloatOption:
+    """Return the option NAME for a position on an axis; TEXT is its help."""
+    return FloatOption(
+        name=name, help=text, default=default, unit="mm", minimum=-MAX_POSITION, maximum=MAX_POSITION
+    )

@@ -6,7 +6,7 @@ from coordinator.config.errors import ConfigError
 from coordinator.config.file import RawSection
 from coordinator.config.model import ExtruderDescription, ExtruderStepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec, TextOption
-from coordinator.config.sections.bounds import MAX_ACCEL, MAX_SPEED
+from coordinator.config.sections.bounds import MAX_SPEED, accel_option, speed_option
 from coordinator.config.sections.heater_options import EXTRUDER_HEATER_OPTIONS, UNSUPPORTED_HEATER_OPTIONS
 from coordinator.config.sections.printer import PrinterSection
 from coordinator.config.sections.reading import Reading
@@ -14,7 +14,7 @@ from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import UNSUPPORTED_EXTRUDER_OPTIONS
 from coordinator.kinematics.base import FILAMENT, StepFunction, WorkSpace
 from coordinator.motion.specs import MotionLimits
-from coordinator.support.quoting import nearest
+from coordinator.support.quoting import nearest_or_all
 
 NOZZLE_DIAMETER = FloatOption(
     name="nozzle_diameter", help="bore of the nozzle", unit="mm", above=0, maximum=20
@@ -37,19 +37,13 @@ MAX_ONLY_DISTANCE = FloatOption(
     minimum=0,
     maximum=100_000,
 )
-MAX_ONLY_VELOCITY = FloatOption(
-    name="max_extrude_only_velocity",
-    help="highest speed of filament alone, by default max_velocity · 4 nozzle_diameter² / filament area",
-    unit="mm/s",
-    above=0,
-    maximum=MAX_SPEED,
+MAX_ONLY_VELOCITY = speed_option(
+    "max_extrude_only_velocity",
+    "highest speed of filament alone, by default max_velocity · 4 nozzle_diameter² / filament area",
 )
-MAX_ONLY_ACCEL = FloatOption(
-    name="max_extrude_only_accel",
-    help="highest acceleration of filament alone, by default max_accel · 4 nozzle_diameter² / filament area",
-    unit="mm/s²",
-    above=0,
-    maximum=MAX_ACCEL,
+MAX_ONLY_ACCEL = accel_option(
+    "max_extrude_only_accel",
+    "highest acceleration of filament alone, by default max_accel · 4 nozzle_diameter² / filament area",
 )
 CORNER_VELOCITY = FloatOption(
     name="instantaneous_corner_velocity",
@@ -174,7 +168,7 @@ def _read_follower(
     followed = next((extruder for extruder in extruders if extruder.name == name), None)
     if name and followed is None:
         names = tuple(extruder.name for extruder in extruders)
-        hint = nearest(name, names) or f"; there is {', '.join(names) or 'none'}"
+        hint = nearest_or_all(name, names)
         raise reader.bad(FOLLOWED, f"but there is no such extruder{hint}")
     _check_advance(reader, followed)
     active = followed is not None and followed is extruders[0]

@@ -69,7 +69,7 @@ PID_KP: Final = _gain("p", "K of error", "1/K")
 PID_KI: Final = _gain("i", "K of error and s", "1/(K·s)")
 PID_KD: Final = _gain("d", "K per s", "s/K")
 HEATER_POWER: Final = FloatOption(
-    name="heater_power", help="MPC: what the heater takes when fully on", unit="W", above=0, maximum=50_000
+    name="heater_power", help="MPC: power of the heater when fully on", unit="W", above=0, maximum=50_000
 )
 BLOCK_HEAT_CAPACITY: Final = FloatOption(
     name="block_heat_capacity",
@@ -94,7 +94,7 @@ SENSOR_RESPONSIVENESS: Final = FloatOption(
 )
 TARGET_REACH_TIME: Final = FloatOption(
     name="target_reach_time",
-    help="MPC: how far ahead the power is reckoned",
+    help="MPC: how far ahead the power is calculated",
     default=2.0,
     unit="s",
     above=0,
@@ -121,7 +121,7 @@ FAN_TRANSFER: Final = TextOption(
 )
 AMBIENT_SENSOR: Final = TextOption(
     name="ambient_temp_sensor",
-    help="MPC: section of a sensor that tells the temperature around the heater",
+    help="MPC: section of a sensor for the temperature around the heater",
     pattern_rule="the name of a sensor's section, as in temperature_sensor NAME",
 )
 PID_OPTIONS: Final[tuple[Option[float], ...]] = (PID_KP, PID_KI, PID_KD)
@@ -165,7 +165,7 @@ MIN_EXTRUDE_TEMP: Final = FloatOption(
 )
 FILAMENT_DENSITY: Final = FloatOption(
     name="filament_density",
-    help="MPC: of the filament, whose heat is provided for before it passes; 0: it is not",
+    help="MPC: of the filament, whose heat is taken into account; 0: it is not",
     default=1.2,
     unit="g/cm³",
     minimum=0,

@@ -4,31 +4,14 @@ from coordinator.config.errors import NotSupported
 from coordinator.config.model import HomingDescription
 from coordinator.config.options import BoolOption, FloatOption, SectionReader
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
-from coordinator.config.sections.bounds import MAX_ACCEL, MAX_POSITION, MAX_SPEED
+from coordinator.config.sections.bounds import MAX_POSITION, accel_option, position_option, speed_option
 from coordinator.config.sections.virtual_endstops import find_diag_pin
 
 ENDSTOP_PIN = PinOption(name="endstop_pin", help="the endstop's input", pullable=True, share="endstop")
-POSITION_ENDSTOP = FloatOption(
-    name="position_endstop",
-    help="where the axis is when the endstop switches",
-    unit="mm",
-    minimum=-MAX_POSITION,
-    maximum=MAX_POSITION,
-)
-HOMING_SPEED = FloatOption(
-    name="homing_speed",
-    help="speed towards the endstop",
-    default=5.0,
-    unit="mm/s",
-    above=0,
-    maximum=MAX_SPEED,
-)
-SECOND_HOMING_SPEED = FloatOption(
-    name="second_homing_speed",
-    help="speed of the second approach; by default half of homing_speed",
-    unit="mm/s",
-    above=0,
-    maximum=MAX_SPEED,
+POSITION_ENDSTOP = position_option("position_endstop", "where the axis is when the endstop switches")
+HOMING_SPEED = speed_option("homing_speed", "speed towards the endstop", 5.0)
+SECOND_HOMING_SPEED = speed_option(
+    "second_homing_speed", "speed of the second approach; by default half of homing_speed"
 )
 RETRACT_DISTANCE = FloatOption(
     name="homing_retract_dist",
@@ -38,19 +21,9 @@ RETRACT_DISTANCE = FloatOption(
     minimum=0,
     maximum=MAX_POSITION,
 )
-RETRACT_SPEED = FloatOption(
-    name="homing_retract_speed",
-    help="speed of the way back; by default homing_speed",
-    unit="mm/s",
-    above=0,
-    maximum=MAX_SPEED,
-)
-ACCEL = FloatOption(
-    name="homing_accel",
-    help="acceleration while it homes, where max_accel allows more; by default max_accel",
-    unit="mm/s²",
-    above=0,
-    maximum=MAX_ACCEL,
+RETRACT_SPEED = speed_option("homing_retract_speed", "speed of the way back; by default homing_speed")
+ACCEL = accel_option(
+    "homing_accel", "acceleration while it homes, where max_accel allows more; by default max_accel"
 )
 POSITIVE_DIR = BoolOption(
     name="homing_positive_dir",

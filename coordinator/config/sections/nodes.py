@@ -199,7 +199,7 @@ def make_pin_registry(config: ConfigFile, nodes: tuple[NodeDescription, ...]) ->
 
 
 def _note_chips(config: ConfigFile, registry: PinRegistry) -> None:
-    """Have REGISTRY know the sections whose pins other sections may name."""
+    """Register the sections whose pins other sections may name."""
     for section in config.sections.values():
         if section.kind == MULTI_PIN:
             registry.chips[MULTI_PIN] = section.name

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from coordinator.config.errors import ConfigError
 from coordinator.config.file import RawSection
 from coordinator.config.options import ChoiceOption, FloatOption, SectionReader, SectionSpec, one_of
-from coordinator.config.sections.bounds import MAX_ACCEL, MAX_SPEED
+from coordinator.config.sections.bounds import MAX_SPEED, accel_option, speed_option
 from coordinator.config.sections.kinematics.registry import KINDS, PRINTER_SPECS
 
 KINEMATICS = ChoiceOption(
@@ -13,31 +13,19 @@ KINEMATICS = ChoiceOption(
     help="how the steppers move the head",
     choices=tuple(KINDS),
 )
-MAX_VELOCITY = FloatOption(
-    name="max_velocity", help="highest speed of the head", unit="mm/s", above=0, maximum=MAX_SPEED
-)
-MAX_ACCEL_OPTION = FloatOption(
-    name="max_accel", help="highest acceleration of the head", unit="mm/s²", above=0, maximum=MAX_ACCEL
-)
+MAX_VELOCITY = speed_option("max_velocity", "highest speed of the head")
+MAX_ACCEL_OPTION = accel_option("max_accel", "highest acceleration of the head")
 
 
 def _axis_velocity(axis: str) -> FloatOption:
-    return FloatOption(
-        name=f"max_{axis}_velocity",
-        help=f"highest speed along {axis.upper()}; by default max_velocity",
-        unit="mm/s",
-        above=0,
-        maximum=MAX_SPEED,
+    return speed_option(
+        f"max_{axis}_velocity", f"highest speed along {axis.upper()}; by default max_velocity"
     )
 
 
 def _axis_accel(axis: str) -> FloatOption:
-    return FloatOption(
-        name=f"max_{axis}_accel",
-        help=f"highest acceleration along {axis.upper()}; by default max_accel",
-        unit="mm/s²",
-        above=0,
-        maximum=MAX_ACCEL,
+    return accel_option(
+        f"max_{axis}_accel", f"highest acceleration along {axis.upper()}; by default max_accel"
     )
 
 
@@ -53,17 +41,14 @@ SQUARE_CORNER_VELOCITY = FloatOption(
 )
 MINIMUM_CRUISE_RATIO = FloatOption(
     name="minimum_cruise_ratio",
-    help="share of a short move that is to be cruise, which limits zig-zag",
+    help="smallest share of a short move that is cruise, which limits zig-zag",
     default=0.5,
     minimum=0,
     below=1,
 )
-MAX_ACCEL_TO_DECEL = FloatOption(
-    name="max_accel_to_decel",
-    help="older form of minimum_cruise_ratio, which becomes 1 - max_accel_to_decel / max_accel",
-    unit="mm/s²",
-    above=0,
-    maximum=MAX_ACCEL,
+MAX_ACCEL_TO_DECEL = accel_option(
+    "max_accel_to_decel",
+    "older form of minimum_cruise_ratio, which becomes 1 - max_accel_to_decel / max_accel",
 )
 PRINTER = SectionSpec(
     help="The machine as a whole, whatever its kinematics",
@@ -132,7 +117,7 @@ def _cruise_ratio(reader: SectionReader, max_accel: float) -> float:
     if reader.has(MINIMUM_CRUISE_RATIO):
         return reader.get(
             MINIMUM_CRUISE_RATIO
-        )  # then an older max_accel_to_decel beside it has no effect: finish tells
+        )  # then an older max_accel_to_decel has no effect: finish reports it
     max_accel_to_decel = reader.find(MAX_ACCEL_TO_DECEL)
     if max_accel_to_decel is None:
         return reader.get(MINIMUM_CRUISE_RATIO)

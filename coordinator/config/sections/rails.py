@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from coordinator.config.model import RailDescription, StepperDescription
+from coordinator.config.model import NO_ENDSTOP, HomingDescription, RailDescription, StepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
-from coordinator.config.sections.bounds import MAX_BELT_POSITION, MAX_POSITION
+from coordinator.config.sections.bounds import MAX_BELT_POSITION, MAX_POSITION, position_option
 from coordinator.config.sections.homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
 from coordinator.config.sections.reading import Reading, SecondEndstop
 from coordinator.config.sections.steppers import MOTOR, TURNING_MOTOR, extra_sections, read_stepper
@@ -17,18 +17,11 @@ class _UpperEnd(FloatOption):
     """The end of a range."""
 
     def stand_in(self) -> float:
-        """Return the furthest: no place is told to lie outside of a range that nobody gave."""
+        """Return the furthest: positions are not checked against a range that is missing."""
         return MAX_POSITION
 
 
-POSITION_MIN = FloatOption(
-    name="position_min",
-    help="lowest position of the axis",
-    default=0.0,
-    unit="mm",
-    minimum=-MAX_POSITION,
-    maximum=MAX_POSITION,
-)
+POSITION_MIN = position_option("position_min", "lowest position of the axis", 0.0)
 POSITION_MAX = _UpperEnd(
     name="position_max",
     help="highest position of the axis",
@@ -67,6 +60,21 @@ def read_axis(reading: Reading, reader: SectionReader, axis: str, function: Step
     homing = read_homing(reader, low, high, reading.pins)
     further = read_extra_steppers(reading, reader.name, function)
     return RailDescription(axis, (first, *further), low, high, homing, reader.place)
+
+
+def read_tower(
+    reading: Reading, reader: SectionReader, name: str, function: StepFunction, homing: HomingDescription
+) -> RailDescription:
+    """Return the rail NAME of a tower, an arm or a winch, whose range follows from the kinematics.
+
+    READER, of the section of its first stepper, is finished. Raises ConfigError.
+    """
+    steppers = (
+        read_stepper(reader, function, reading.pins),
+        *read_extra_steppers(reading, reader.name, function),
+    )
+    reading.finish(reader, waiting=WAITING if homing.waits or homing is NO_ENDSTOP else ())
+    return RailDescription(name, steppers, None, None, homing, reader.place)
 
 
 def read_range(reader: SectionReader) -> tuple[float, float]:

@@ -42,7 +42,7 @@ ADC_VOLTAGE: Final = FloatOption(
 )
 VOLTAGE_OFFSET: Final = FloatOption(
     name="voltage_offset",
-    help="what is added to the voltage of a sensor's amplifier",
+    help="offset of the voltage of a sensor's amplifier",
     default=0.0,
     unit="V",
     minimum=-100,
@@ -50,14 +50,14 @@ VOLTAGE_OFFSET: Final = FloatOption(
 )
 MIN_TEMP: Final = FloatOption(
     name="min_temp",
-    help="lowest temperature that makes sense; below it the node stops everything",
+    help="lowest plausible temperature; below it the node stops the machine",
     unit="°C",
     minimum=-273.15,
     maximum=1500,
 )
 MAX_TEMP: Final = FloatOption(
     name="max_temp",
-    help="highest temperature allowed; above it the node stops everything",
+    help="highest temperature allowed; above it the node stops the machine",
     unit="°C",
     minimum=-273.15,
     maximum=1500,
@@ -102,7 +102,7 @@ SENSOR_LIST: Final = ListOption(
 )
 COMBINATION_METHOD: Final = ChoiceOption(
     name="combination_method",
-    help="temperature_combined: what is made of them",
+    help="temperature_combined: how they are combined",
     default="mean",
     choices=("min", "max", "mean"),
 )

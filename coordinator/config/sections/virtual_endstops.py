@@ -1,4 +1,4 @@
-"""``endstop_pin: tmc2209_stepper_x:virtual_endstop``: an endstop that a stepper's driver feels.
+"""``endstop_pin: tmc2209_stepper_x:virtual_endstop``: sensorless homing by a stepper's driver.
 
 The driver raises its DIAG, so the endstop's pin is ``diag_pin`` of the driver's section, on whatever node.
 """
@@ -8,18 +8,17 @@ from typing import Final
 from coordinator.config.file import ConfigFile
 from coordinator.config.options import BadValue, SectionReader
 from coordinator.config.pins import PinName, PinOption, PinRegistry
+from coordinator.drivers.tmc_chips import CHIPS
 from coordinator.support.quoting import nearest, shown
 
-STALL_KINDS: Final = ("tmc2209",)
-"""First words of the sections of drivers that can feel the end of an axis."""
-NUMB_KINDS: Final = ("tmc2208",)
-"""Of those that cannot."""
+STALL_KINDS: Final = tuple(name for name, chip in CHIPS.items() if chip.has_stallguard)
+"""First words of the sections of drivers that can detect the end of an axis."""
 NAME: Final = "virtual_endstop"
 _DIAG: Final = PinOption(name="diag_pin", help="", pullable=True)
 
 
 def note_diag_pins(config: ConfigFile, pins: PinRegistry) -> None:
-    """Have PINS know the diag_pin of every driver's section that CONFIG has."""
+    """Register the diag_pin of every driver's section of CONFIG in PINS."""
     for section in config.sections.values():
         if section.kind not in STALL_KINDS:
             continue
@@ -27,7 +26,7 @@ def note_diag_pins(config: ConfigFile, pins: PinRegistry) -> None:
         try:
             found = None if given is None else _DIAG.parse(given.value)
         except BadValue:
-            found = None  # its own section tells
+            found = None  # reported for its own section
         pins.diag_pins[f"{section.kind}_{section.instance}"] = found
 
 
@@ -39,8 +38,8 @@ def find_diag_pin(
     Raises ConfigError for a driver that does not exist or has no diag_pin.
     """
     kind, _, stepper = pin.node.partition("_")
-    if kind in NUMB_KINDS:
-        raise reader.bad(option, f"but a {kind.upper()} cannot feel the end of an axis; use a switch")
+    if kind in CHIPS and kind not in STALL_KINDS:
+        raise reader.bad(option, f"but a {kind.upper()} cannot detect the end of an axis; use a switch")
     if kind not in STALL_KINDS:
         return None
     section = f"[{kind} {stepper}]"

@@ -6,6 +6,7 @@ from coordinator.gcode.builtins import machine as machine_commands
 from coordinator.gcode.builtins import state as state_commands
 from coordinator.gcode.commands import AtStandstill, ProgramContext
 from coordinator.gcode.events import Done, Emergency, Reply, Wait
+from coordinator.gcode.parameters import bounded, numbers
 from coordinator.gcode.parser import Command, WordError, number
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.motion.planner.language import ARC_LETTERS, Plane
@@ -16,12 +17,6 @@ Handler = Callable[[ProgramContext, Command], bool]
 returns False it changes nothing but the planner's queue."""
 
 MAX_DWELL_S = 86400.0
-
-
-def _numbers(command: Command, allowed: str) -> dict[str, float]:
-    """Read COMMAND's words of ALLOWED, all with numbers; others are ignored."""
-    words = command.only_words(allowed)
-    return {letter: number(command.name, words, letter) for letter in words}
 
 
 def _positive(command: Command, words: Mapping[str, float]) -> None:
@@ -35,15 +30,15 @@ def _move(job: ProgramContext, command: Command) -> bool:
     words = command.words()
     for letter in words.keys() - set(MOVE_LETTERS):
         job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
-    numbers = {letter: number(command.name, words, letter) for letter in words if letter in MOVE_LETTERS}
-    status = job.planner.move(numbers)
+    values = {letter: number(command.name, words, letter) for letter in words if letter in MOVE_LETTERS}
+    status = job.planner.move(values)
     if status is FeedStatus.LIMIT:
         raise WordError(str(job.planner.fault))
     return status is not FeedStatus.FULL
 
 
 def _dwell(job: ProgramContext, command: Command) -> bool:
-    words = _numbers(command, "PS")
+    words = numbers(command, "PS")
     seconds = words.get("P", 0.0) / 1000 + words.get("S", 0.0)
     if not 0 <= seconds <= MAX_DWELL_S:
         raise WordError(f"G4 is to wait {seconds:g} s; 0 to {MAX_DWELL_S:g} s are possible")
@@ -53,25 +48,11 @@ def _dwell(job: ProgramContext, command: Command) -> bool:
     return True
 
 
-def _unit(unit_mm: float) -> Handler:
+def _set(attribute: str, value: object) -> Handler:
+    """Return what sets an ATTRIBUTE of the planner to VALUE."""
+
     def handle(job: ProgramContext, _command: Command) -> bool:
-        job.planner.unit_mm = unit_mm
-        return True
-
-    return handle
-
-
-def _relative(*, relative: bool) -> Handler:
-    def handle(job: ProgramContext, _command: Command) -> bool:
-        job.planner.relative = relative
-        return True
-
-    return handle
-
-
-def _relative_extrusion(*, relative: bool) -> Handler:
-    def handle(job: ProgramContext, _command: Command) -> bool:
-        job.planner.relative_extrusion = relative
+        setattr(job.planner, attribute, value)
         return True
 
     return handle
@@ -101,7 +82,7 @@ def _home(job: ProgramContext, command: Command) -> bool:
 
 
 def _set_origin(job: ProgramContext, command: Command) -> bool:
-    words = _numbers(command, AXIS_LETTERS)
+    words = numbers(command, AXIS_LETTERS)
     if command.text and not words:
         return True  # only what has no meaning: that is not the bare G92
     job.planner.set_gcode_position(words or dict.fromkeys(AXIS_LETTERS, 0.0))
@@ -110,7 +91,7 @@ def _set_origin(job: ProgramContext, command: Command) -> bool:
 
 def _set_accel(job: ProgramContext, command: Command) -> bool:
     """M204 that the hot path refused: above what is configured, or of unusual words."""
-    words = _numbers(command, "SPTR")
+    words = numbers(command, "SPTR")
     words.pop("R", None)
     _positive(command, words)
     if "S" in words:
@@ -126,7 +107,7 @@ def _set_accel(job: ProgramContext, command: Command) -> bool:
 def _limit_axes(what: str) -> Handler:
     def handle(job: ProgramContext, command: Command) -> bool:
         """M201, M203: what slicers write as the machine's limits; those of the configuration hold, too."""
-        words = _numbers(command, AXIS_LETTERS)
+        words = numbers(command, AXIS_LETTERS)
         _positive(command, words)
         job.planner.limit_axes(what, words)
         return True
@@ -136,7 +117,7 @@ def _limit_axes(what: str) -> Handler:
 
 def _set_jerk(job: ProgramContext, command: Command) -> bool:
     """M205: the lesser of X and Y is the speed at a right-angled corner; the rest means nothing here."""
-    words = _numbers(command, "XYZEBSTJ")
+    words = numbers(command, "XYZEBSTJ")
     corner = [words[letter] for letter in "XY" if letter in words]
     if corner:
         _positive(command, {"X or Y": min(corner)})
@@ -151,31 +132,28 @@ def _cap(job: ProgramContext, what: str, asked: float, limit: float) -> None:
 
 def _set_velocity_limit(job: ProgramContext, command: Command) -> bool:
     planner, limits = job.planner, job.planner.limits
-    values = command.only_parameters(("VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"))
-    numbers = {key: number(command.name, values, key) for key in values}
-    for key, value in numbers.items():
-        low = 0.0 if key in {"SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"} else 1e-3
-        high = 0.999 if key == "MINIMUM_CRUISE_RATIO" else 1e9
-        if not low <= value <= high:
-            raise WordError(f"{key} of SET_VELOCITY_LIMIT is {value:g}; {low:g} to {high:g} are possible")
-    if "VELOCITY" in numbers:
-        _cap(job, "the velocity", numbers["VELOCITY"], limits.max_velocity)
-        planner.max_velocity = numbers["VELOCITY"]
-    if "ACCEL" in numbers:
-        _cap(job, "the acceleration", numbers["ACCEL"], limits.max_accel)
-        planner.accel = numbers["ACCEL"]
-    if "SQUARE_CORNER_VELOCITY" in numbers:
-        asked = numbers["SQUARE_CORNER_VELOCITY"]
-        _cap(job, "the square corner velocity", asked, limits.square_corner_velocity)
-        planner.square_corner_velocity = asked
-    if "MINIMUM_CRUISE_RATIO" in numbers:
-        planner.minimum_cruise_ratio = numbers["MINIMUM_CRUISE_RATIO"]
+    given = command.only_parameters(("VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"))
+    velocity = bounded(command, given, "VELOCITY", None, low=1e-3, high=1e9)
+    accel = bounded(command, given, "ACCEL", None, low=1e-3, high=1e9)
+    corner = bounded(command, given, "SQUARE_CORNER_VELOCITY", None, low=0, high=1e9)
+    ratio = bounded(command, given, "MINIMUM_CRUISE_RATIO", None, low=0, high=0.999)
+    if velocity is not None:
+        _cap(job, "the velocity", velocity, limits.max_velocity)
+        planner.max_velocity = velocity
+    if accel is not None:
+        _cap(job, "the acceleration", accel, limits.max_accel)
+        planner.accel = accel
+    if corner is not None:
+        _cap(job, "the square corner velocity", corner, limits.square_corner_velocity)
+        planner.square_corner_velocity = corner
+    if ratio is not None:
+        planner.minimum_cruise_ratio = ratio
     return True
 
 
 def _factor(job: ProgramContext, command: Command) -> bool:
     """M220, M221: percent in S; without it, nothing changes."""
-    percent = _numbers(command, "S").get("S")
+    percent = numbers(command, "S").get("S")
     if percent is None:
         return True
     if not 1 <= percent <= 1000:
@@ -194,7 +172,7 @@ def _wait_for_moves(job: ProgramContext, _command: Command) -> bool:
     return True
 
 
-def _tell_position(job: ProgramContext, _command: Command) -> bool:
+def _report_position(job: ProgramContext, _command: Command) -> bool:
     position = zip(AXIS_LETTERS, job.planner.gcode_position, strict=True)
     job.emit(
         Reply(job.line, " ".join(f"{letter}:{value:.3f}" for letter, value in position), ReplyKind.PLAIN)
@@ -208,9 +186,8 @@ def _emergency(job: ProgramContext, _command: Command) -> bool:
 
 
 def _without_module(what: str) -> Handler:
-    def handle(job: ProgramContext, command: Command) -> bool:
-        job.record(command)
-        job.notice(what, "accepted and recorded, but without effect: no module acts on them yet")
+    def handle(job: ProgramContext, _command: Command) -> bool:
+        job.notice(what, "accepted, but without effect: no section of the configuration is for them")
         return True
 
     return handle
@@ -236,8 +213,8 @@ def _arc(job: ProgramContext, command: Command) -> bool:
         words = command.words()
         for letter in words.keys() - set(ARC_LETTERS):
             job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
-        numbers = {letter: number(command.name, words, letter) for letter in words if letter in ARC_LETTERS}
-        fault = planner.begin_arc(numbers, clockwise=command.name.startswith("G2"))
+        values = {letter: number(command.name, words, letter) for letter in words if letter in ARC_LETTERS}
+        fault = planner.begin_arc(values, clockwise=command.name.startswith("G2"))
         if fault is not None:
             raise WordError(f"{command.name} {fault}")
     status = planner.go_on_with_arc()
@@ -246,23 +223,15 @@ def _arc(job: ProgramContext, command: Command) -> bool:
     return status is not FeedStatus.FULL
 
 
-def _plane(plane: Plane) -> Handler:
-    def handle(job: ProgramContext, _command: Command) -> bool:
-        job.planner.plane = plane
-        return True
-
-    return handle
-
-
 _HEATS = ("M104", "M109", "M140", "M190")
-_told_heat = _without_module("heater and fan commands")
+_without_heater = _without_module("heater and fan commands")
 
 
 def _heat(job: ProgramContext, command: Command) -> bool:
     """Accept what is for a heater or fan that the machine does not have, not for one that does not act."""
     why = job.vocabulary.unsupported.get(command.name)
     if why is None:
-        return _told_heat(job, command)
+        return _without_heater(job, command)
     words = command.words()
     asks = [letter for letter in "SR" if letter in words and number(command.name, words, letter) > 0]
     if command.name in _HEATS and asks:
@@ -286,23 +255,23 @@ HANDLERS: Mapping[str, Handler] = {
     **dict.fromkeys(("G2", "G3"), _arc),
     "G5": _refuse_spline,
     "G4": _dwell,
-    "G17": _plane(Plane.XY),
-    "G18": _plane(Plane.ZX),
-    "G19": _plane(Plane.YZ),
-    "G20": _unit(25.4),
-    "G21": _unit(1.0),
+    "G17": _set("plane", Plane.XY),
+    "G18": _set("plane", Plane.ZX),
+    "G19": _set("plane", Plane.YZ),
+    "G20": _set("unit_mm", 25.4),
+    "G21": _set("unit_mm", 1.0),
     "G28": _home,
-    "G90": _relative(relative=False),
-    "G91": _relative(relative=True),
+    "G90": _set("relative", False),
+    "G91": _set("relative", True),
     "G92": _set_origin,
     **dict.fromkeys(("M18", "M84"), _motors_off),
     **dict.fromkeys(("M73", "M117"), _ignore),
     "M118": _say,
-    "M82": _relative_extrusion(relative=False),
-    "M83": _relative_extrusion(relative=True),
+    "M82": _set("relative_extrusion", False),
+    "M83": _set("relative_extrusion", True),
     **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
     "M112": _emergency,
-    "M114": _tell_position,
+    "M114": _report_position,
     "M201": _limit_axes("accel"),
     "M203": _limit_axes("velocity"),
     "M204": _set_accel,

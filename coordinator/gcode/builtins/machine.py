@@ -6,13 +6,14 @@ generation as an event with its print time.
 """
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 from coordinator.gcode.commands import ProgramContext
 from coordinator.gcode.events import PositionSet, Reply, ShaperChange, SmoothTimeChange, WeightsChange
-from coordinator.gcode.machine_state import SHAPER_AXES, Extruder, MachineState, Shaper
-from coordinator.gcode.parser import Command, WordError, number, quoted
+from coordinator.gcode.machine_state import DEFAULT_STATE, SHAPER_AXES, Extruder, MachineState, Shaper
+from coordinator.gcode.parameters import bounded, needed
+from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.kinematics.dual_carriage import CarriageMode, CarriageState, DualCarriage
 from coordinator.motion.steps.shapers import split_kind
 
@@ -33,7 +34,7 @@ def come_to_standstill(job: ProgramContext, settle_s: float = 0.0) -> bool:
 
 
 def begin(job: ProgramContext) -> None:
-    """Let JOB's planner begin as its machine's state says."""
+    """Set JOB's planner up for the state of its machine."""
     if job.machine.active is not None:
         _use_extruder(job, job.machine.active)
     _keep_apart(job)
@@ -64,27 +65,6 @@ def home_carriages(job: ProgramContext, axes: str, second_mm: float | None = Non
 # ---- Parameters ------------------------------------------------------------------------------------------
 
 
-def _parameters(command: Command, known: Collection[str]) -> Mapping[str, str]:
-    """Read NAME=VALUE parameters, of which KNOWN are the names; others are ignored."""
-    return command.only_parameters(known)
-
-
-def _needed(command: Command, values: Mapping[str, str], key: str) -> str:
-    if key not in values:
-        raise WordError(f"{command.name} has no {key}; add {key}=...")
-    return values[key]
-
-
-def _number(command: Command, values: Mapping[str, str], key: str, high: float) -> float | None:
-    """Read a number from 0 to HIGH; None when it is not given."""
-    if key not in values:
-        return None
-    value = number(command.name, values, key)
-    if not 0 <= value <= high:
-        raise WordError(f"{key} of {command.name} is {value:g}; 0 to {high:g} are possible")
-    return value
-
-
 def _extruder(job: ProgramContext, command: Command, name: str | None) -> Extruder:
     """Return the extruder NAME, without a name the active one."""
     extruders = job.machine.extruders
@@ -104,7 +84,7 @@ def set_pressure_advance(job: ProgramContext, command: Command) -> bool:
 
     So does the first ADVANCE above 0, which needs the window.
     """
-    values = _parameters(command, ("ADVANCE", "SMOOTH_TIME", "EXTRUDER"))
+    values = command.only_parameters(("ADVANCE", "SMOOTH_TIME", "EXTRUDER"))
     name = values.get("EXTRUDER")
     filament = job.machine.filament
     if name is not None and name not in job.machine.extruders and filament is not None:
@@ -114,10 +94,10 @@ def set_pressure_advance(job: ProgramContext, command: Command) -> bool:
             job.notice(f"{command.name} of {values['EXTRUDER']}", "it follows no extruder: without effect")
             return True
     extruder = _extruder(job, command, name)
-    advance = _number(command, values, "ADVANCE", MAX_ADVANCE_S)
-    smooth = _number(command, values, "SMOOTH_TIME", MAX_SMOOTH_S)
-    needed = smooth if smooth is not None else extruder.smooth_s
-    window = needed if advance or extruder.window_s else 0.0
+    advance = bounded(command, values, "ADVANCE", None, low=0, high=MAX_ADVANCE_S)
+    smooth = bounded(command, values, "SMOOTH_TIME", None, low=0, high=MAX_SMOOTH_S)
+    smooth_s = extruder.smooth_s if smooth is None else smooth
+    window = smooth_s if advance or extruder.window_s else 0.0
     if window != extruder.window_s:
         if job.while_printing:
             raise WordError(
@@ -128,7 +108,7 @@ def set_pressure_advance(job: ProgramContext, command: Command) -> bool:
             return False
         extruder.window_s = window
         job.emit(SmoothTimeChange(job.line, extruder.name, window, job.planner.print_time_end_s))
-    extruder.smooth_s = needed
+    extruder.smooth_s = smooth_s
     if advance is not None:
         extruder.pressure_advance_s = advance
         if extruder is job.machine.active:
@@ -141,8 +121,8 @@ def set_pressure_advance(job: ProgramContext, command: Command) -> bool:
 
 def activate_extruder(job: ProgramContext, command: Command) -> bool:
     """ACTIVATE_EXTRUDER EXTRUDER=name: from now on E moves this one, and reads where this one stands."""
-    values = _parameters(command, ("EXTRUDER",))
-    return _activate(job, _extruder(job, command, _needed(command, values, "EXTRUDER")))
+    values = command.only_parameters(("EXTRUDER",))
+    return _activate(job, _extruder(job, command, needed(command, values, "EXTRUDER")))
 
 
 def is_tool(name: str) -> bool:
@@ -181,7 +161,7 @@ def _activate(job: ProgramContext, extruder: Extruder) -> bool:
 
 
 def _change_places(job: ProgramContext, before: Extruder | None, after: Extruder) -> None:
-    """Let E read where AFTER was left; the machine's E axis goes on from where BEFORE has brought it."""
+    """Make E read the last position of AFTER; the machine's E axis continues from that of BEFORE."""
     planner = job.planner
     if before is not None:
         before.place_mm = planner.gcode_position[3] * planner.unit_mm
@@ -200,8 +180,8 @@ def _follow(job: ProgramContext) -> None:
 
 def sync_extruder_motion(job: ProgramContext, command: Command) -> bool:
     """EXTRUDER: a filament stepper; MOTION_QUEUE: the extruder it moves with, empty for none."""
-    values = _parameters(command, ("EXTRUDER", "MOTION_QUEUE"))
-    stepper, queue = (_needed(command, values, key) for key in ("EXTRUDER", "MOTION_QUEUE"))
+    values = command.only_parameters(("EXTRUDER", "MOTION_QUEUE"))
+    stepper, queue = (needed(command, values, key) for key in ("EXTRUDER", "MOTION_QUEUE"))
     motion = job.machine.filament
     if motion is None:
         raise WordError("SYNC_EXTRUDER_MOTION needs an extruder; this machine has none")
@@ -221,11 +201,11 @@ def sync_extruder_motion(job: ProgramContext, command: Command) -> bool:
 def set_input_shaper(job: ProgramContext, command: Command) -> bool:
     """SHAPER_TYPE of all axes; SHAPER_TYPE_X, SHAPER_FREQ_X (0: not shaped), DAMPING_RATIO_X of one."""
     words = ("SHAPER_TYPE", "SHAPER_FREQ", "DAMPING_RATIO")
-    values = _parameters(command, ("SHAPER_TYPE", *(f"{w}_{axis}" for w in words for axis in SHAPER_AXES)))
+    values = command.only_parameters(("SHAPER_TYPE", *(f"{w}_{axis}" for w in words for axis in SHAPER_AXES)))
     before = {axis: job.machine.shapers.get(axis, Shaper()) for axis in SHAPER_AXES}
     after = {axis: _shaper(command, values, axis, shaper) for axis, shaper in before.items()}
     if not values:
-        job.emit(Reply(job.line, " ".join(_told(axis, shaper) for axis, shaper in after.items())))
+        job.emit(Reply(job.line, " ".join(_shown(axis, shaper) for axis, shaper in after.items())))
         return True
     # An axis that is not shaped stays so whatever its kind would be.
     changed = [a for a in SHAPER_AXES if after[a] != before[a] and (before[a].width_s or after[a].width_s)]
@@ -245,8 +225,8 @@ def _shaper(command: Command, values: Mapping[str, str], axis: str, before: Shap
         split_kind(kind)
     except ValueError as problem:
         raise WordError(f"{command.name} names the shaper {quoted(kind)}; {problem}") from None
-    frequency = _number(command, values, f"SHAPER_FREQ_{axis}", MAX_FREQUENCY_HZ)
-    damping = _number(command, values, f"DAMPING_RATIO_{axis}", 0.999)
+    frequency = bounded(command, values, f"SHAPER_FREQ_{axis}", None, low=0, high=MAX_FREQUENCY_HZ)
+    damping = bounded(command, values, f"DAMPING_RATIO_{axis}", None, low=0, high=0.999)
     if frequency is not None and 0 < frequency < 1:
         raise WordError(f"SHAPER_FREQ_{axis} of {command.name} is {frequency:g}; give 0 or 1 Hz and more")
     return Shaper(
@@ -256,7 +236,7 @@ def _shaper(command: Command, values: Mapping[str, str], axis: str, before: Shap
     )
 
 
-def _told(axis: str, shaper: Shaper) -> str:
+def _shown(axis: str, shaper: Shaper) -> str:
     return (
         f"SHAPER_TYPE_{axis}={shaper.kind} SHAPER_FREQ_{axis}={shaper.frequency_hz:g} "
         f"DAMPING_RATIO_{axis}={shaper.damping_ratio:g}"
@@ -268,11 +248,9 @@ def _told(axis: str, shaper: Shaper) -> str:
 
 def set_dual_carriage(job: ProgramContext, command: Command) -> bool:
     """CARRIAGE 0 or 1; MODE is PRIMARY where it is not given."""
-    values = _parameters(command, ("CARRIAGE", "MODE"))
-    carriages, state = job.machine.carriages, job.machine.carriage_state
-    if carriages is None or state is None:
-        raise WordError("SET_DUAL_CARRIAGE needs a second carriage; this machine has no [dual_carriage]")
-    which = _needed(command, values, "CARRIAGE")
+    carriages, state = _dual(job, command)
+    values = command.only_parameters(("CARRIAGE", "MODE"))
+    which = needed(command, values, "CARRIAGE")
     if which not in {"0", "1"}:
         raise WordError(f"CARRIAGE of {command.name} is {quoted(which)}; give 0 or 1")
     word = values.get("MODE", CarriageMode.PRIMARY.value).upper()
@@ -291,7 +269,8 @@ def set_dual_carriage(job: ProgramContext, command: Command) -> bool:
 
 def save_dual_carriage_state(job: ProgramContext, command: Command) -> bool:
     """NAME: keep what both carriages do."""
-    carriages, state, name = _dual(job, command)
+    carriages, state = _dual(job, command)
+    name = command.only_parameters(("NAME",)).get("NAME", DEFAULT_STATE)
     position = job.planner.toolhead_position[carriages.axis]
     job.machine.saved_carriages[name] = replace(state, positions=state.at(position))
     return True
@@ -299,8 +278,9 @@ def save_dual_carriage_state(job: ProgramContext, command: Command) -> bool:
 
 def restore_dual_carriage_state(job: ProgramContext, command: Command) -> bool:
     """NAME: let both carriages do what they did then; with MOVE=0 only, they stay where they are."""
-    carriages, state, name = _dual(job, command)
-    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
+    carriages, state = _dual(job, command)
+    values = command.only_parameters(("NAME", "MOVE", "MOVE_SPEED"))
+    name = values.get("NAME", DEFAULT_STATE)
     saved = job.machine.saved_carriages.get(name)
     if saved is None:
         raise WordError(f"{command.name} names the state {quoted(name)}, which is not saved")
@@ -319,12 +299,11 @@ def restore_dual_carriage_state(job: ProgramContext, command: Command) -> bool:
     return True
 
 
-def _dual(job: ProgramContext, command: Command) -> tuple[DualCarriage, CarriageState, str]:
-    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
+def _dual(job: ProgramContext, command: Command) -> tuple[DualCarriage, CarriageState]:
     carriages, state = job.machine.carriages, job.machine.carriage_state
     if carriages is None or state is None:
         raise WordError(f"{command.name} needs a second carriage; this machine has no [dual_carriage]")
-    return carriages, state, values.get("NAME", "default")
+    return carriages, state
 
 
 def _take_carriages(job: ProgramContext, carriages: DualCarriage, after: CarriageState) -> None:

@@ -1,11 +1,12 @@
 """Where a program's numbers point: offsets of the origin, states that are saved and restored, all frames."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from coordinator.gcode.commands import ProgramContext
 from coordinator.gcode.events import Reply
-from coordinator.gcode.machine_state import SavedState
+from coordinator.gcode.machine_state import DEFAULT_STATE, SavedState
+from coordinator.gcode.parameters import flag
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.gcode.status import frames, motion_figures
 from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus, Planner
@@ -14,18 +15,6 @@ MOVE_SPEED_MM_S: Final = 50.0
 """Of the moves that these commands make, unless they say otherwise."""
 SAVED_MAX: Final = 100
 """States that may be kept."""
-_DEFAULT_STATE: Final = "default"
-
-
-def _parameters(command: Command, known: Collection[str]) -> Mapping[str, str]:
-    return command.only_parameters(known)
-
-
-def _flag(command: Command, values: Mapping[str, str], key: str) -> bool:
-    text = values.get(key, "0")
-    if text not in {"0", "1"}:
-        raise WordError(f"{key} of {command.name} is {quoted(text)}; give 0 or 1")
-    return text == "1"
 
 
 def _speed(job: ProgramContext, command: Command, values: Mapping[str, str], otherwise_mm_s: float) -> float:
@@ -51,10 +40,10 @@ def go(job: ProgramContext, target: list[float], speed_mm_s: float) -> bool:
 def set_gcode_offset(job: ProgramContext, command: Command) -> bool:
     """X Y Z E: the offset; X_ADJUST ...: by how much it changes; MOVE=1: go along at once.
 
-    Beside a job, MOVE makes the job's next move also make up for the change: it does not stop for it.
+    While a job prints, MOVE adds the change to the job's next move: the job does not stop for it.
     """
     adjust = [f"{axis}_ADJUST" for axis in AXIS_LETTERS]
-    values = _parameters(command, (*AXIS_LETTERS, *adjust, "MOVE", "MOVE_SPEED"))
+    values = command.only_parameters((*AXIS_LETTERS, *adjust, "MOVE", "MOVE_SPEED"))
     planner = job.planner
     before = dict(zip(AXIS_LETTERS, planner.gcode_offset, strict=True))
     after: dict[str, float] = {}
@@ -64,7 +53,7 @@ def set_gcode_offset(job: ProgramContext, command: Command) -> bool:
         elif f"{axis}_ADJUST" in values:
             after[axis] = before[axis] + number(command.name, values, f"{axis}_ADJUST")
     change = {axis: value - before[axis] for axis, value in after.items()}
-    if _flag(command, values, "MOVE") and any(change.values()):
+    if flag(command, values, "MOVE") and any(change.values()):
         if job.while_printing:
             _check_reach(job, change)
             for axis, distance in change.items():
@@ -79,7 +68,7 @@ def set_gcode_offset(job: ProgramContext, command: Command) -> bool:
 
 
 def _check_reach(job: ProgramContext, change: Mapping[str, float]) -> None:
-    """Refuse an offset that would take the very next move out of the machine; the job goes on without it."""
+    """Refuse an offset that would take the next move out of the machine; the job continues without it."""
     limits = job.planner.limits
     for axis, at, low, high in zip(
         "XYZ", job.planner.toolhead_position, limits.position_min, limits.position_max, strict=False
@@ -96,8 +85,8 @@ def _check_reach(job: ProgramContext, change: Mapping[str, float]) -> None:
 
 
 def save_gcode_state(job: ProgramContext, command: Command) -> bool:
-    """NAME: keep modes, speed, factors, origin, offset and position."""
-    name = _parameters(command, ("NAME",)).get("NAME", _DEFAULT_STATE)
+    """NAME: save modes, speed, factors, origin, offset and position."""
+    name = command.only_parameters(("NAME",)).get("NAME", DEFAULT_STATE)
     save_state(job, name)
     return True
 
@@ -127,19 +116,19 @@ def present_state(planner: Planner) -> SavedState:
 
 
 def restore_gcode_state(job: ProgramContext, command: Command) -> bool:
-    """NAME: let all that be as it was; MOVE=1: also go back to where X Y Z were."""
-    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
-    name = values.get("NAME", _DEFAULT_STATE)
+    """NAME: restore all that; MOVE=1: also move back to where X Y Z were."""
+    values = command.only_parameters(("NAME", "MOVE", "MOVE_SPEED"))
+    name = values.get("NAME", DEFAULT_STATE)
     saved = job.machine.saved.get(name)
     if saved is None:
         has = f"there is {', '.join(job.machine.saved)}" if job.machine.saved else "none is saved"
         raise WordError(f"{command.name} names the state {quoted(name)}, which is not saved; {has}")
-    speed = _speed(job, command, values, saved.speed_mm_s) if _flag(command, values, "MOVE") else None
+    speed = _speed(job, command, values, saved.speed_mm_s) if flag(command, values, "MOVE") else None
     return restore_state(job, saved, speed)
 
 
 def restore_state(job: ProgramContext, saved: SavedState, move_mm_s: float | None) -> bool:
-    """Let all be as it was when SAVED was; MOVE_MM_S: also go back at this speed.
+    """Restore SAVED; MOVE_MM_S: also move back at this speed.
 
     E reads as it did, wherever the filament is meanwhile. False: the planner has to be emptied first.
     """
@@ -161,9 +150,9 @@ def restore_state(job: ProgramContext, saved: SavedState, move_mm_s: float | Non
 def come_back(
     planner: Planner, saved: SavedState, speed_mm_s: float, lift_mm: float = 0.0, *, left_out: bool = False
 ) -> bool:
-    """Let a job go on where SAVED says, and read as it did; offsets changed meanwhile and factors stay.
+    """Move back to SAVED and restore the job's frame; offsets changed meanwhile and factors stay.
 
-    X and Y are gone to at the greater height of both places, LIFT_MM above the one where it goes on.
+    X and Y are approached at the greater of both heights, LIFT_MM above the one where the job continues.
     LEFT_OUT: the head stays above it, and moves are left out from there on. False: the planner has to be
     emptied first. Raises WordError.
     """

@@ -1,25 +1,23 @@
 """Enable pins: a driver is switched on before its motor moves, and all are switched off by M84.
 
-SET_STEPPER_ENABLE is for trying out: it switches one, and those that share its pin.
+SET_STEPPER_ENABLE is for tests: it switches one driver, and those that share its pin.
 """
 
 import asyncio
 from collections.abc import Collection, Iterable, Mapping
 from typing import Final
 
-from coordinator.config.options import SectionSpec
 from coordinator.config.pins import PinDescription
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading
 from coordinator.gcode.events import Done
-from coordinator.gcode.parser import WordError, quoted
+from coordinator.gcode.parameters import flag, one
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
 from nodes.node.node import Node
 
 WAKE_S: Final = 0.1
-"""Drivers need a moment after they were switched on or off, before what comes next."""
+"""Drivers need this long after they were switched on or off."""
 
 
 class EnableLine(DigitalOut):
@@ -32,15 +30,13 @@ class EnableLine(DigitalOut):
         self.on = False
 
     def started(self, node: "Node") -> None:
-        """Take note that all is as configured: off."""
+        """Record that the drivers are off, as configured."""
         super().started(node)
         self.on = False
 
 
 class MotorPower(Module):
     """The enable pins of a machine's steppers."""
-
-    SPEC = SectionSpec(help="Enable pins", options=())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -53,26 +49,17 @@ class MotorPower(Module):
                 line.steppers.append(stepper.name)
         self._lines = tuple(lines.values())
         self._motors = build.machine.motors
-        self._live: ModuleContext | None = None
         for line in self._lines:
             build.add_device(line.node, line)
         for name in ("M84", "M18"):
-            build.add_command(
-                GCodeCommand(name, "Switch all motors off; nothing is homed any more", self._read_off)
-            )
-        build.add_command(GCodeCommand("M17", "Switch all motors on", self._read_on))
+            build.add_command(name, "Switch all motors off; no axis is homed then", self._read_off)
+        build.add_command("M17", "Switch all motors on", self._read_on)
         build.add_command(
-            GCodeCommand(
-                "SET_STEPPER_ENABLE", "Switch the motor STEPPER on or off (ENABLE=1, 0)", self._read_one
-            )
+            "SET_STEPPER_ENABLE", "Switch the motor STEPPER on or off (ENABLE=1, 0)", self._read_one
         )
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
-
     def stopped(self, cause: str) -> None:
-        """Take note that the nodes have switched all off."""
+        """Record that the nodes have switched all drivers off."""
         del cause
         for line in self._lines:
             line.on = False
@@ -113,17 +100,11 @@ class MotorPower(Module):
 
     def _read_one(self, call: Call) -> Reading:
         values = call.parameters("STEPPER", "ENABLE")
-        name, enable = values.get("STEPPER", ""), values.get("ENABLE", "1")
-        names = [stepper for line in self._lines for stepper in line.steppers]
-        if name not in names:
-            raise WordError(
-                f"SET_STEPPER_ENABLE names {quoted(name)}; motors with enable pins: {' '.join(names)}"
-            )
-        if enable not in ("0", "1"):
-            raise WordError(f"ENABLE of SET_STEPPER_ENABLE is {quoted(enable)}; it must be 0 or 1")
+        name = one(call.command, values, "STEPPER", self.are_on())
+        enable = flag(call.command, {"ENABLE": "1", **values}, "ENABLE")
         lines = [line for line in self._lines if name in line.steppers]
-        done = Done(unhomed="" if enable == "1" else self._moved_by(lines))
-        return AtStandstill(lambda: self._some(lines, enable == "1", done), done)
+        done = Done(unhomed="" if enable else self._moved_by(lines))
+        return AtStandstill(lambda: self._some(lines, enable, done), done)
 
     def _moved_by(self, lines: "Iterable[EnableLine]") -> str:
         """Return the letters of the axes whose place is not sure when the motors of LINES are off."""

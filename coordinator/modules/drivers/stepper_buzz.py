@@ -1,15 +1,13 @@
-"""STEPPER_BUZZ: one motor goes a little way to and fro, to see which one it is and that it is wired."""
+"""STEPPER_BUZZ: moves one motor back and forth, to identify it and to check its wiring."""
 
 import math
 from typing import Final
 
 from coordinator.config.model import StepperDescription
-from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
-from coordinator.gcode.parser import WordError, quoted
+from coordinator.gcode.parameters import one
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.single import Ramp, SingleMove
 
 TIMES: Final = 10
@@ -23,27 +21,16 @@ THERE_S: Final = 0.25
 class StepperBuzz(Module):
     """The command."""
 
-    SPEC = SectionSpec(help="Motors to and fro", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._steppers = {stepper.name: stepper for stepper in build.machine.steppers}
-        self._live: ModuleContext | None = None
         build.add_command(
-            GCodeCommand("STEPPER_BUZZ", "Move the motor STEPPER to and fro ten times, by 1 mm", self._read)
+            "STEPPER_BUZZ", "Move the motor STEPPER back and forth ten times, by 1 mm or 1 degree", self._read
         )
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
-
     def _read(self, call: Call) -> Reading:
-        name = call.parameters("STEPPER").get("STEPPER", "")
-        stepper = self._steppers.get(name)
-        if stepper is None:
-            raise WordError(
-                f"STEPPER_BUZZ names the motor {quoted(name)}; there are {' '.join(self._steppers)}"
-            )
+        name = one(call.command, call.parameters("STEPPER"), "STEPPER", self._steppers)
+        stepper = self._steppers[name]
         done = Done(position=call.position, moved=True)  # it ends where it began, to the step
 
         async def buzz() -> Done:
@@ -53,9 +40,8 @@ class StepperBuzz(Module):
         return AtStandstill(buzz, done)
 
     async def _buzz(self, stepper: "StepperDescription") -> None:
-        assert self._live is not None
         way = WAY_RAD if stepper.function.turns else WAY_MM
         speed = 2 * way / THERE_S
         ramp = Ramp(way, speed, 4 * speed / THERE_S)
         for direction in (1.0, -1.0) * TIMES:
-            await SingleMove(self._live.machine, ramp, ways={stepper.name: direction}).run()
+            await SingleMove(self.live.machine, ramp, ways={stepper.name: direction}).run()

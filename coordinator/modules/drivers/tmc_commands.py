@@ -1,17 +1,16 @@
 """What the drivers of a machine have in common: their wires, and the commands that name a stepper."""
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from coordinator.config.errors import ConfigError
-from coordinator.config.options import SectionSpec
 from coordinator.config.pins import PinDescription
 from coordinator.drivers.tmc_chips import Field
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
+from coordinator.gcode.parameters import one, value
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import one, parameters, value
-from coordinator.support.quoting import nearest
+from coordinator.support.quoting import nearest_or_all
 from nodes.devices.tmcuart import TmcUart
 
 if TYPE_CHECKING:
@@ -21,27 +20,25 @@ if TYPE_CHECKING:
 class TmcCommands(Module):
     """The commands, and the wires."""
 
-    SPEC: ClassVar = SectionSpec(help="What stepper drivers have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._drivers: dict[str, TmcDriver] = {}
         self._wires: dict[tuple[str, str, str], TmcUart] = {}
         for name, text, read in (
-            ("INIT_TMC", "write all registers of the driver of STEPPER= again", self._init),
-            ("DUMP_TMC", "show the registers of the driver of STEPPER=, or only REGISTER=", self._dump),
+            ("INIT_TMC", "Write all registers of the driver of STEPPER= again", self._init),
+            ("DUMP_TMC", "Show the registers of the driver of STEPPER=, or only REGISTER=", self._dump),
             (
                 "SET_TMC_CURRENT",
-                "set the currents of the driver of STEPPER=: CURRENT= and HOLDCURRENT=, A RMS",
+                "Set the currents of the driver of STEPPER=: CURRENT= and HOLDCURRENT=, A RMS",
                 self._set_current,
             ),
             (
                 "SET_TMC_FIELD",
-                "set FIELD= of the driver of STEPPER= to VALUE=, or to what stands for VELOCITY= (mm/s)",
+                "Set FIELD= of the driver of STEPPER= to VALUE=, or to the value for VELOCITY= (mm/s)",
                 self._set_field,
             ),
         ):
-            build.add_command(GCodeCommand(name, text, read))
+            build.add_command(name, text, read)
 
     def wire(self, build: Build, rx: "PinDescription", tx: "PinDescription | None") -> tuple[TmcUart, str]:
         """Return the wire on these pins and its node, for the section of BUILD; raises ConfigError."""
@@ -59,11 +56,11 @@ class TmcCommands(Module):
         return self._wires[key], rx.node
 
     def add(self, driver: "TmcDriver", build: Build) -> None:
-        """Take in a DRIVER; raises ConfigError when its stepper or its address has one already."""
+        """Register DRIVER; raises ConfigError when its stepper or its address has one already."""
         for other in self._drivers.values():
             if other.stepper.name == driver.stepper.name:
                 raise ConfigError(
-                    build.place, f"[{other.name}] and [{driver.name}] are one stepper's; remove one"
+                    build.place, f"[{other.name}] and [{driver.name}] are for the same stepper; remove one"
                 )
             if other.wire is driver.wire and other.address == driver.address:
                 raise ConfigError(
@@ -79,7 +76,7 @@ class TmcCommands(Module):
         return self._drivers[one(call.command, given, "STEPPER", self._drivers)]
 
     def _init(self, call: Call) -> Reading:
-        driver = self._driver(call, parameters(call.command, ("STEPPER",)))
+        driver = self._driver(call, call.parameters("STEPPER"))
 
         async def perform() -> Done:
             await driver.set_up()
@@ -88,7 +85,7 @@ class TmcCommands(Module):
         return AtStandstill(perform)
 
     def _dump(self, call: Call) -> Reading:
-        given = parameters(call.command, ("STEPPER", "REGISTER"))
+        given = call.parameters("STEPPER", "REGISTER")
         driver = self._driver(call, given)
         only = one(call.command, given, "REGISTER", driver.CHIP.registers) if "REGISTER" in given else ""
 
@@ -98,7 +95,7 @@ class TmcCommands(Module):
         return AtStandstill(perform)
 
     def _set_current(self, call: Call) -> Reading:
-        given = parameters(call.command, ("STEPPER", "CURRENT", "HOLDCURRENT"))
+        given = call.parameters("STEPPER", "CURRENT", "HOLDCURRENT")
         driver = self._driver(call, given)
         most = driver.settings.largest_a
         for name in ("CURRENT", "HOLDCURRENT"):
@@ -111,19 +108,19 @@ class TmcCommands(Module):
         async def perform() -> Done:
             run_a = value(call.command, given, "CURRENT", driver.run_a)
             await driver.set_current(run_a, value(call.command, given, "HOLDCURRENT", driver.hold_a))
-            told = f"{driver.stepper.name}: run current {driver.run_a:g} A, hold current {driver.hold_a:g} A"
-            return Done((told,))
+            text = f"{driver.stepper.name}: run current {driver.run_a:g} A, hold current {driver.hold_a:g} A"
+            return Done((text,))
 
         return AtStandstill(perform)
 
     def _set_field(self, call: Call) -> Reading:
-        given = parameters(call.command, ("STEPPER", "FIELD", "VALUE", "VELOCITY"))
+        given = call.parameters("STEPPER", "FIELD", "VALUE", "VELOCITY")
         driver = self._driver(call, given)
         name = given.get("FIELD", "").lower()
         register = driver.CHIP.field_register(name)
         if register is None:
             names = driver.CHIP.writable_fields
-            hint = nearest(name, names) or f"; there is {', '.join(names)}"
+            hint = nearest_or_all(name, names)
             raise WordError(f"SET_TMC_FIELD: there is no field {quoted(name)}{hint}")
         field = register.field(name)
         number = self._field_value(call, driver, given, field)

@@ -1,8 +1,8 @@
 """[tmc2209 STEPPER], [tmc2208 STEPPER]: stepper drivers that are set, read and watched over a UART.
 
-What the driver has to be is kept in `values`: it is written when the driver's node is ready, and again when
-that comes back. Every WATCH_S the driver is asked how it is; with a fault that a motor must not move with,
-the machine stops and says why.
+`values` has what the registers have to be: they are written when the driver's node is ready, and again when
+the node comes back. Every WATCH_S the driver's status is read; on a fault with which a motor must not move
+the machine stops, with the cause.
 """
 
 import asyncio
@@ -28,18 +28,18 @@ from coordinator.modules.drivers.tmc_options import (
 )
 from coordinator.modules.homing.virtual_endstop import StallEndstop
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest, shown
+from coordinator.support.quoting import nearest_or_all, shown
 from coordinator.support.values import Value
 from nodes.devices.tmcuart import TmcError
 from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
 WATCH_S: Final = 1.0
-"""How often a driver is asked how it is."""
+"""How often a driver's status is read."""
 SILENT_MAX: Final = 3
-"""So often in a row it may fail to answer that."""
+"""How often in a row it may fail to answer."""
 GSTAT_ALL: Final = 0b111
-"""Written, it takes the notes of a reset and of faults back."""
+"""Written, it clears the flags of a reset and of faults."""
 FEELING_SHARE: Final = 0.5
 """StallGuard acts from this share of the homing speed on: below, and at rest, its figures mean nothing."""
 
@@ -68,7 +68,6 @@ class TmcDriver(StallEndstop):
         """What has to be in its registers."""
         self.run_a, self.hold_a = self.settings.run_a, self.settings.hold_a
         self._drv_status: Mapping[str, int] = {}
-        self._live: ModuleContext | None = None
         self._watch: asyncio.Task[None] | None = None
         self._is_new: asyncio.Event | None = None
         self._warned = False
@@ -76,11 +75,11 @@ class TmcDriver(StallEndstop):
     # ------------------------------------------------------------------------------------------ device
 
     def configure(self, config: object) -> None:
-        """Have nothing on the node beside the wire, which is the commands'."""
+        """Do nothing: only the wire is on the node, and the commands have it."""
         del config
 
     def started(self, node: "Node") -> None:
-        """Take note that the driver may have forgotten all, as its NODE is ready."""
+        """Set the driver again, which may have lost its registers, as its NODE is ready."""
         del node
         if self._is_new is not None:
             self._is_new.set()
@@ -89,7 +88,7 @@ class TmcDriver(StallEndstop):
 
     async def connect(self, live: "ModuleContext") -> None:
         """Set the driver; raises CanductorError when it cannot be."""
-        self._live = live
+        await super().connect(live)
         self._is_new = asyncio.Event()
         both_edges = live.machine.devices.steppers[self.stepper.name].steps_on_both_edges
         self.values = self.settings.registers(both_edges=both_edges)
@@ -99,18 +98,14 @@ class TmcDriver(StallEndstop):
             self._is_new.set()
         self._watch = asyncio.get_running_loop().create_task(self._keep_watch())
 
-    def stopped(self, cause: str) -> None:
-        """Watch no more."""
+    def end(self, cause: str) -> None:
+        """Stop watching."""
         del cause
-        self.close()
-
-    def close(self) -> None:
-        """Watch no more."""
         if self._watch is not None:
             self._watch.cancel()
 
     def status(self) -> Mapping[str, Value]:
-        """Tell its currents, A, and what it said last."""
+        """Report its currents, A, and the last status of the driver."""
         return {
             "run_current": self.run_a,
             "hold_current": self.hold_a,
@@ -122,9 +117,7 @@ class TmcDriver(StallEndstop):
 
     @property
     def _node(self) -> "Node":
-        if self._live is None:
-            raise CanductorError(f"[{self.name}] needs a machine that is connected")
-        return self._live.node(self.node_name)
+        return self.live.node(self.node_name)
 
     # --------------------------------------------------------------------------------------- registers
 
@@ -149,8 +142,8 @@ class TmcDriver(StallEndstop):
         version = await self.read("IOIN") >> 24
         if version != self.CHIP.version and self._live is not None:
             self._live.say(
-                f"[{self.name}]: the driver says that its version is {version:#x}, which is none of a"
-                f" {self.CHIP.name.upper()} ({self.CHIP.version:#x}); check the section's name"
+                f"[{self.name}]: the driver reports version {version:#x}, but a {self.CHIP.name.upper()} has"
+                f" {self.CHIP.version:#x}; check the section's name"
             )
         await self.write(self.values)
         for name, value in self.values.items():
@@ -190,11 +183,11 @@ class TmcDriver(StallEndstop):
 
     @contextlib.asynccontextmanager
     async def feeling(self, speed: float) -> AsyncIterator[None]:
-        """Let StallGuard act while the axis moves at SPEED (mm/s): in StealthChop, as the chip asks for."""
+        """Enable StallGuard while the axis moves at SPEED (mm/s), in StealthChop as the chip requires."""
         threshold = self.settings.coolstep or speed * FEELING_SHARE
         if threshold >= speed:
             raise CanductorError(
-                f"{self._who} cannot feel the end of the axis at {speed:g} mm/s: its coolstep_threshold is"
+                f"{self._who} cannot detect the end of the axis at {speed:g} mm/s: its coolstep_threshold is"
                 f" {threshold:g} mm/s; home faster, or lower it"
             )
         fields = {"en_spreadcycle": 0, "tpwmthrs": 0, "tcoolthrs": self.settings.tstep(threshold)}
@@ -206,7 +199,7 @@ class TmcDriver(StallEndstop):
         try:
             yield
         except BaseException:
-            with contextlib.suppress(CanductorError):  # what it was called off for is told
+            with contextlib.suppress(CanductorError):  # the error that ended it is reported
                 await self.write(before)
             raise
         await self.write(before)
@@ -214,7 +207,6 @@ class TmcDriver(StallEndstop):
     # ------------------------------------------------------------------------------------------- watch
 
     async def _keep_watch(self) -> None:
-        assert self._live is not None
         assert self._is_new is not None
         silent = 0
         while True:
@@ -232,16 +224,18 @@ class TmcDriver(StallEndstop):
                     self._check(await self.read("GSTAT"), await self.read("DRV_STATUS"))
                 silent = 0
             except DriverFaultError as error:
-                self._live.stop(str(error))
+                self.live.stop(str(error))
             except CanductorError as error:
                 silent += 1
-                if silent >= SILENT_MAX and self._node.talks:  # else its node's own trouble is told elsewhere
-                    self._live.stop(str(error))
+                if (
+                    silent >= SILENT_MAX and self._node.talks
+                ):  # else its node's own trouble is reported elsewhere
+                    self.live.stop(str(error))
                 if self._is_new.is_set():
                     await asyncio.sleep(WATCH_S)
 
     def _check(self, gstat: int, drv_status: int) -> None:
-        """Take note of what the driver says; raises DriverFaultError."""
+        """Evaluate the driver's status registers; raises DriverFaultError."""
         register = self.CHIP.registers["DRV_STATUS"]
         said = {field.name: value for field in register.fields if (value := field.of(drv_status))}
         self._drv_status = said
@@ -271,12 +265,13 @@ class TmcDriver(StallEndstop):
 
 
 class DriverFaultError(CanductorError):
-    """A driver says that its motor must not move."""
+    """A driver reports a fault with which its motor must not move."""
 
 
 class Tmc2209(TmcDriver):
     """A TMC2209."""
 
+    KIND = "tmc2209"
     CHIP = TMC2209
     SPEC = driver_spec(TMC2209)
 
@@ -284,6 +279,7 @@ class Tmc2209(TmcDriver):
 class Tmc2208(TmcDriver):
     """A TMC2208, and its like of the same registers: TMC2225."""
 
+    KIND = "tmc2208"
     CHIP = TMC2208
     SPEC = driver_spec(TMC2208)
 
@@ -294,7 +290,7 @@ def _stepper(build: Build) -> "StepperDescription":
     found = steppers.get(build.instance)
     if found is None:
         build.needs_acting(build.instance)
-        hint = nearest(build.instance, steppers) or f"; there is {', '.join(steppers)}"
+        hint = nearest_or_all(build.instance, steppers)
         raise ConfigError(
             build.place,
             f"[{build.name}] refers to unknown stepper {shown(build.instance)}{hint}",

@@ -20,7 +20,7 @@ UART_PIN: Final = PinOption(
 )
 TX_PIN: Final = PinOption(
     name="tx_pin",
-    help="where it is written to, if that is not uart_pin",
+    help="output to the driver, where that is not uart_pin",
     invertible=False,
     share="tmc_tx",
 )
@@ -30,26 +30,16 @@ UART_ADDRESS: Final = IntOption(
 ONLY_UART_ADDRESS: Final = IntOption(
     name="uart_address", help="this driver has no other address", default=0, minimum=0, maximum=0
 )
-RUN_CURRENT: Final = FloatOption(
-    name="run_current",
-    help="current of a motor that moves, RMS",
-    unit="A",
-    above=0,
-    maximum=MAX_CURRENT_A,
-)
-HOLD_CURRENT: Final = FloatOption(
-    name="hold_current",
-    help="current of a motor that stands, RMS; by default run_current",
-    unit="A",
-    above=0,
-    maximum=MAX_CURRENT_A,
-)
-HOME_CURRENT: Final = FloatOption(
-    name="home_current",
-    help="current while it feels for the end of its axis, RMS; by default run_current",
-    unit="A",
-    above=0,
-    maximum=MAX_CURRENT_A,
+
+
+def _current(name: str, text: str) -> FloatOption:
+    return FloatOption(name=name, help=text, unit="A", above=0, maximum=MAX_CURRENT_A)
+
+
+RUN_CURRENT: Final = _current("run_current", "current while the motor moves, RMS")
+HOLD_CURRENT: Final = _current("hold_current", "current at standstill, RMS; by default run_current")
+HOME_CURRENT: Final = _current(
+    "home_current", "current during sensorless homing, RMS; by default run_current"
 )
 SENSE_RESISTOR: Final = FloatOption(
     name="sense_resistor",
@@ -60,7 +50,7 @@ SENSE_RESISTOR: Final = FloatOption(
     maximum=1,
 )
 INTERPOLATE: Final = BoolOption(
-    name="interpolate", help="let the driver make 256 microsteps out of those that it gets", default=True
+    name="interpolate", help="have the driver interpolate to 256 microsteps", default=True
 )
 STEALTHCHOP: Final = FloatOption(
     name="stealthchop_threshold",
@@ -106,7 +96,7 @@ _DRIVER_FIELDS: Final = {
 """With their defaults: those of the data sheets' quick start for steppers of printers."""
 _STALL_FIELDS: Final = {"SGTHRS": 0, "SEMIN": 0, "SEUP": 0, "SEMAX": 0, "SEDN": 0, "SEIMIN": 0}
 _HELP: Final = {
-    "SGTHRS": "how easily StallGuard takes the motor for stalled: 0 hardly, 255 at once",
+    "SGTHRS": "sensitivity of StallGuard: 0 lowest, 255 highest",
     "TOFF": "chopper off time; 0 would switch the driver off",
 }
 _PREFIX: Final = "driver_"

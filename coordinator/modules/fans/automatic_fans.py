@@ -1,8 +1,7 @@
-"""[heater_fan NAME] and [controller_fan NAME]: fans that run while something else is hot or at work."""
+"""[heater_fan NAME] and [controller_fan NAME]: fans that run while a heater is hot or motors are on."""
 
 from typing import ClassVar, Final
 
-from coordinator.config.errors import ConfigError
 from coordinator.config.options import FloatOption, IntOption, ListOption, SectionSpec
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.drivers.motor_power import MotorPower
@@ -16,14 +15,13 @@ from coordinator.modules.fans.fan_unit import (
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest, shown
 
 LOOK_S: Final = 1.0
 FULL: Final = shutdown_speed(1.0)
 OFF: Final = shutdown_speed(0.0)
 HEATER: Final = ListOption(
     name="heater",
-    help="the heaters it belongs to; none: it never runs",
+    help="the heaters that it cools; none: it never runs",
     default=("extruder",),
     may_be_empty=True,
 )
@@ -36,18 +34,18 @@ HEATER_TEMP: Final = FloatOption(
     maximum=1500,
 )
 FAN_SPEED: Final = FloatOption(
-    name="fan_speed", help="how fast it then runs", default=1.0, minimum=0, maximum=1
+    name="fan_speed", help="its speed while it runs", default=1.0, minimum=0, maximum=1
 )
 IDLE_TIMEOUT: Final = IntOption(
     name="idle_timeout",
-    help="for how long it goes on at idle_speed when nothing is at work any more",
+    help="how long it runs at idle_speed after steppers and heaters were switched off",
     default=30,
     unit="s",
     minimum=0,
     maximum=1_000_000_000,
 )
 IDLE_SPEED: Final = FloatOption(
-    name="idle_speed", help="how fast it runs then; by default fan_speed", minimum=0, maximum=1
+    name="idle_speed", help="its speed then; by default fan_speed", minimum=0, maximum=1
 )
 STEPPER: Final = ListOption(
     name="stepper", help="the steppers it cools: it runs while one of them is on; by default all"
@@ -67,27 +65,24 @@ class _HeaterNames:
         self._heaters = build.shared(HeaterRegistry)
 
     def find(self, modules: Modules) -> list[Heater]:
-        """Return those that act; raises ConfigError. A default that does not exist is nobody's mistake."""
+        """Return those that act; raises ConfigError. A default that does not exist is no mistake."""
         known = {name: unit for unit in self._heaters.units.values() for name in (unit.key, unit.name)}
         found = []
         for name in self._names:
             if name in known:
                 found.append(known[name])
             elif self._given and not modules.is_left_out(name):
-                hint = nearest(name, tuple(known)) or f"; there is {', '.join(known) or 'none'}"
-                raise ConfigError(
-                    self._reader.place_of(self._option),
-                    f"'heater' of [{self._reader.name}] names {shown(name)}, which does not exist{hint}",
-                )
+                raise self._reader.unknown(self._option, name, known)
         return found
 
 
 class HeaterFan(FanModule):
     """A fan that runs while a heater is hot."""
 
+    KIND = "heater_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="A fan that runs while a heater is hot or is to be, as that of a hot end",
+        help="A fan that runs while a heater is hot or has a target, such as that of a hot end",
         options=(*fan_options(FULL), HEATER, HEATER_TEMP, FAN_SPEED),
         unsupported=UNSUPPORTED_FAN_OPTIONS,
     )
@@ -107,7 +102,7 @@ class HeaterFan(FanModule):
         self._heaters = self._names.find(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to look."""
+        """Start the periodic check."""
         await super().connect(live)
         live.every(LOOK_S, self._look)
 
@@ -120,8 +115,9 @@ class HeaterFan(FanModule):
 
 
 class ControllerFan(FanModule):
-    """A fan that cools a board while it is at work."""
+    """A fan that cools a board while its motors or heaters are on."""
 
+    KIND = "controller_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that runs while steppers are on or a heater has a target, and some time after; steppers"
@@ -148,7 +144,6 @@ class ControllerFan(FanModule):
         self._idle_speed = self._speed if idle is None else idle
         self._idle_s = build.get(IDLE_TIMEOUT)
         self._heaters: list[Heater] = []
-        self._live: ModuleContext | None = None
         self._worked_s: float | None = None
 
     @staticmethod
@@ -157,11 +152,7 @@ class ControllerFan(FanModule):
         given = build.find(STEPPER)
         for name in given or ():
             if name not in known:
-                hint = nearest(name, known) or f"; there is {', '.join(known)}"
-                raise ConfigError(
-                    build.reader.place_of(STEPPER),
-                    f"'stepper' of [{build.name}] names {shown(name)}, which does not exist{hint}",
-                )
+                raise build.reader.unknown(STEPPER, name, known)
         return given or tuple(known)
 
     def link(self, modules: Modules) -> None:
@@ -169,22 +160,18 @@ class ControllerFan(FanModule):
         self._heaters = self._names.find(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to look."""
+        """Start the periodic check."""
         await super().connect(live)
-        self._live = live
         live.every(LOOK_S, self._look)
 
     def _look(self) -> None:
-        assert self._live is not None
-        now_s = self._live.now_s()
-        if self._moves(self._live) or any(unit.target_c > 0 for unit in self._heaters):
+        now_s = self.live.now_s()
+        on = self._power.are_on()
+        moves = any(on.get(name, self.live.machine.busy) for name in self._steppers)
+        if moves or any(unit.target_c > 0 for unit in self._heaters):
             self._worked_s = now_s
             self.unit.set_speed(self._speed)
         elif self._worked_s is not None and now_s - self._worked_s < self._idle_s:
             self.unit.set_speed(self._idle_speed)
         else:
             self.unit.set_speed(0.0)
-
-    def _moves(self, live: "ModuleContext") -> bool:
-        on = self._power.are_on()
-        return any(on.get(name, live.machine.busy) for name in self._steppers)

@@ -6,7 +6,7 @@ from typing import Any, Final
 from coordinator.config.options import BoolOption, FloatOption, IntOption, Option
 from coordinator.config.pins import PinOption
 from coordinator.modules.base import Build, Module
-from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
+from coordinator.modules.outputs.timing import AHEAD_S, pwm_cycle
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.counter import Counter
@@ -18,7 +18,7 @@ from nodes.support.errors import CanductorError
 
 PIN: Final = PinOption(name="pin", help="output that drives the fan")
 MAX_POWER: Final = FloatOption(
-    name="max_power", help="share of full power that a speed of 1 stands for", default=1.0, above=0, maximum=1
+    name="max_power", help="share of full power at speed 1", default=1.0, above=0, maximum=1
 )
 CYCLE_TIME: Final = FloatOption(
     name="cycle_time",
@@ -33,16 +33,16 @@ HARDWARE_PWM: Final = BoolOption(
 )
 KICK_START_TIME: Final = FloatOption(
     name="kick_start_time",
-    help="how long it runs at full power when it starts, or is to run much faster",
+    help="how long it runs at full power when it starts, or speeds up a lot",
     default=0.1,
     unit="s",
     minimum=0,
     maximum=10,
 )
 OFF_BELOW: Final = FloatOption(
-    name="off_below", help="at less than this speed it is off", default=0.0, minimum=0, maximum=1
+    name="off_below", help="speeds below this switch it off", default=0.0, minimum=0, maximum=1
 )
-ENABLE_PIN: Final = PinOption(name="enable_pin", help="output that is on while the fan is to run at all")
+ENABLE_PIN: Final = PinOption(name="enable_pin", help="output that is on while the fan runs")
 TACHOMETER_PIN: Final = PinOption(
     name="tachometer_pin", help="input of the fan's tachometer", invertible=False, pullable=True
 )
@@ -51,7 +51,7 @@ TACHOMETER_PPR: Final = IntOption(
 )
 TACHOMETER_POLL: Final = FloatOption(
     name="tachometer_poll_interval",
-    help="how often the tachometer is looked at; below 30 / (tachometer_ppr · turns per minute)",
+    help="how often the tachometer is read; below 30 / (tachometer_ppr · turns per minute)",
     default=0.0015,
     unit="s",
     minimum=0.0001,
@@ -117,14 +117,14 @@ class FanUnit:
             invert=pin.invert,
             shutdown=stopped * self._max_power if hardware else stopped,
         )
-        add_pinned(build, self._output, pin)
+        build.add_device(pin.node, self._output, pin)
         build.add_device(pin.node, self)
         self._enable = self._enable_node = None
         enable = build.find_pin(ENABLE_PIN)
         if enable is not None:
             self._enable = DigitalOut(f"the power of [{build.name}]", pin=enable.name, invert=enable.invert)
             self._enable_node = enable.node
-            add_pinned(build, self._enable, enable)
+            build.add_device(enable.node, self._enable, enable)
         self._add_tachometer(build)
         self._live: ModuleContext | None = None
 
@@ -141,22 +141,22 @@ class FanUnit:
             self.rpm = frequency * 60 / pulses
 
         counter.on_frequency = counted
-        add_pinned(build, counter, tachometer)
+        build.add_device(tachometer.node, counter, tachometer)
 
     def configure(self, config: NodeConfig) -> None:
         """Do nothing: its parts are devices too."""
 
     def started(self, node: "Node") -> None:
-        """Take note that its node has started, and the fan stands still, perhaps in the midst of a job."""
+        """Record that the fan is off: its node has started, perhaps during a job."""
         del node
         self.speed = 0.0
 
     def connect(self, live: "ModuleContext") -> None:
-        """Begin to act; the fan stands still."""
+        """Start acting; the fan is off."""
         self._live = live
 
     def end(self) -> None:
-        """Act no more: its node has it at its shutdown speed."""
+        """Stop acting: the node has set its shutdown speed."""
         self._live = None
 
     def set_speed(self, speed: float, print_time_s: float = 0.0) -> None:
@@ -173,7 +173,7 @@ class FanUnit:
             self._drive(live, at_s, speed, before)
         except CanductorError as error:
             self.speed = 0.0
-            live.say(f"[{self.name}] cannot be set: {error}")
+            live.say(f"[{self.name}] was not set: {error}")
 
     def _drive(self, live: "ModuleContext", at_s: float, speed: float, before: float) -> None:
         node = live.node(self.node)
@@ -197,16 +197,13 @@ class FanModule(Module):
     unit: FanUnit
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
+        """Start acting."""
+        await super().connect(live)
         self.unit.connect(live)
 
-    def stopped(self, cause: str) -> None:
-        """Act no more."""
+    def end(self, cause: str) -> None:
+        """Stop acting."""
         del cause
-        self.unit.end()
-
-    def close(self) -> None:
-        """Act no more."""
         self.unit.end()
 
     def status(self) -> Mapping[str, Value]:

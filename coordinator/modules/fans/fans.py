@@ -3,7 +3,8 @@
 from typing import ClassVar, Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
+from coordinator.gcode.commands import Call, Reading, Synchronized
+from coordinator.gcode.parameters import numbers, one, value
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.fans.fan_unit import (
@@ -13,16 +14,16 @@ from coordinator.modules.fans.fan_unit import (
     fan_options,
     shutdown_speed,
 )
-from coordinator.modules.words import numbers, one, parameters, value
 
 OFF: Final = shutdown_speed(0.0)
 FULL: Final = 255.0
-"""The S of M106 that stands for full speed."""
+"""The S of M106 for full speed."""
 
 
 class Fan(FanModule):
     """The fan that cools the part."""
 
+    KIND = "fan"
     SPEC: ClassVar = SectionSpec(
         help="The fan that cools the part: M106, M107",
         options=fan_options(OFF),
@@ -32,10 +33,8 @@ class Fan(FanModule):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.unit = FanUnit(build, OFF)
-        build.add_command(
-            GCodeCommand("M106", "Set the part's fan: S, 0 to 255", self._set, while_printing=True)
-        )
-        build.add_command(GCodeCommand("M107", "Stop the part's fan", self._stop, while_printing=True))
+        build.add_command("M106", "Set the part's fan: S, 0 to 255", self._set, while_printing=True)
+        build.add_command("M107", "Stop the part's fan", self._stop, while_printing=True)
 
     def _set(self, call: Call) -> Reading:
         words = numbers(call.command, "SP")
@@ -55,22 +54,18 @@ class Fan(FanModule):
 class GenericFans(Module):
     """The fans that programs set by their names."""
 
-    SPEC: ClassVar = SectionSpec(help="What fans with a name have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.units: dict[str, FanUnit] = {}
         build.add_command(
-            GCodeCommand(
-                "SET_FAN_SPEED",
-                "Set the speed of a fan_generic: FAN= SPEED=, 0 to 1",
-                self._set,
-                while_printing=True,
-            )
+            "SET_FAN_SPEED",
+            "Set the speed of a fan_generic: FAN= SPEED=, 0 to 1",
+            self._set,
+            while_printing=True,
         )
 
     def _set(self, call: Call) -> Reading:
-        given = parameters(call.command, ("FAN", "SPEED"))
+        given = call.parameters("FAN", "SPEED")
         unit = self.units[one(call.command, given, "FAN", self.units)]
         speed = value(call.command, given, "SPEED", 0.0)
         if not 0 <= speed <= 1:
@@ -81,6 +76,7 @@ class GenericFans(Module):
 class FanGeneric(FanModule):
     """A fan that programs set by its name."""
 
+    KIND = "fan_generic"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that programs set: SET_FAN_SPEED FAN=NAME SPEED=",

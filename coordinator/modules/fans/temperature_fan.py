@@ -1,6 +1,6 @@
 """[temperature_fan NAME]: a fan that holds a temperature down.
 
-While its sensor says nothing, or what cannot be, it runs at its highest speed: nobody knows how hot it is.
+While its sensor is silent or out of range it runs at its highest speed: the temperature is unknown.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,8 @@ from coordinator.config.sections.sensor_options import (
     SENSOR_OPTIONS,
     UNSUPPORTED_SENSOR_OPTIONS,
 )
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
+from coordinator.gcode.commands import Call, Reading, Synchronized
+from coordinator.gcode.parameters import one, value
 from coordinator.gcode.parser import WordError
 from coordinator.heat.controller import Controller
 from coordinator.heat.pid import Pid, PidGains
@@ -30,14 +31,13 @@ from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
-from coordinator.modules.words import one, parameters, value
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 FULL: Final = shutdown_speed(1.0)
 TARGET_TEMP: Final = FloatOption(
     name="target_temp",
-    help="temperature that is not to be exceeded; 0: the fan is off",
+    help="temperature that it must not exceed; 0: the fan is off",
     default=40.0,
     unit="°C",
     minimum=0,
@@ -54,29 +54,25 @@ CONTROL: Final = ChoiceOption(
     unsupported=("curve",),
 )
 MIRROR_C: Final = 5000.0
-"""Controllers heat: mirrored here, too hot becomes too cold."""
+"""Controllers heat: temperatures are mirrored at this one for a fan, which cools."""
 
 
 class TemperatureFans(Module):
     """The fans with a target."""
 
-    SPEC: ClassVar = SectionSpec(help="What fans with a target have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.by_name: dict[str, TemperatureFan] = {}
         build.add_command(
-            GCodeCommand(
-                "SET_TEMPERATURE_FAN_TARGET",
-                "Set what a temperature_fan holds: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
-                self._set,
-                while_printing=True,
-            )
+            "SET_TEMPERATURE_FAN_TARGET",
+            "Set the target of a temperature_fan: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
+            self._set,
+            while_printing=True,
         )
 
     def _set(self, call: Call) -> Reading:
         command = call.command
-        given = parameters(command, ("TEMPERATURE_FAN", "TARGET", "MIN_SPEED", "MAX_SPEED"))
+        given = call.parameters("TEMPERATURE_FAN", "TARGET", "MIN_SPEED", "MAX_SPEED")
         fan = self.by_name[one(command, given, "TEMPERATURE_FAN", self.by_name)]
         target = value(command, given, "TARGET", fan.usual_target_c)
         low = value(command, given, "MIN_SPEED", fan.min_speed)
@@ -98,9 +94,10 @@ class TemperatureFans(Module):
 class TemperatureFan(FanModule):
     """A fan that holds a temperature down."""
 
+    KIND = "temperature_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="A fan that holds a temperature down, as that of a board or a chamber",
+        help="A fan that keeps a temperature down, such as that of a board or a chamber",
         options=(
             *fan_options(FULL),
             *SENSOR_OPTIONS,
@@ -138,20 +135,15 @@ class TemperatureFan(FanModule):
         self.input.link(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
+        """Start acting."""
         await super().connect(live)
         await self.input.connect(live)
         live.every(LOOK_S, lambda: self._look(live))
 
-    def stopped(self, cause: str) -> None:
-        """Act no more."""
-        super().stopped(cause)
+    def end(self, cause: str) -> None:
+        """Stop acting."""
+        super().end(cause)
         self.input.end(cause)
-
-    def close(self) -> None:
-        """Act no more."""
-        super().close()
-        self.input.end("the machine was closed")
 
     def _measured(self, at_s: float, celsius: float) -> None:
         self._silent = False
@@ -165,7 +157,7 @@ class TemperatureFan(FanModule):
         self.unit.set_speed(min(max(wanted, self.min_speed), self.max_speed))
 
     def _look(self, live: "ModuleContext") -> None:
-        """Notice that there are no measurements any more."""
+        """Check that there still are measurements."""
         if self.input.missed() <= SILENT_LOOKS:
             return
         self.unit.set_speed(self.max_speed if self.target_c > 0 else 0.0)
@@ -173,7 +165,7 @@ class TemperatureFan(FanModule):
             return
         self._silent = True
         where = f"check node {self.input.node} and its wires" if self.input.node else "find out why"
-        live.say(f"[{self.name}] runs at its highest speed: its sensor says nothing any more; {where}")
+        live.say(f"[{self.name}] runs at its highest speed: its sensor is silent; {where}")
 
     def status(self) -> Mapping[str, Value]:
         """Report the fan and the temperature."""

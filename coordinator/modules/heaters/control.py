@@ -34,7 +34,7 @@ class ControlSettings:
     """The controller that a section asks for, and what tuning needs to make another."""
 
     def __init__(self, build: Build) -> None:
-        """Read the options; those of other controllers may stand beside them."""
+        """Read the options; those of other controllers are allowed as well."""
         self.kind = build.get(CONTROL)
         self.max_power = build.get(MAX_POWER)
         self.heater_w = build.find(HEATER_POWER)

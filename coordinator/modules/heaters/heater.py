@@ -1,7 +1,7 @@
-"""One heater: sensor, controller, output, and what watches over them.
+"""One heater: sensor, controller, output, and the checks of them.
 
-Three nets, each without the one before it: the controller and the watch over the heater here; the node's own
-limits of what its sensor may read; and the node's max_duration, within which it has to hear from the host.
+Three independent safety nets: the controller and the heater check here; the node's own limits of what its
+sensor may read; and the node's max_duration, within which it has to hear from the host.
 The host renews the output with every measurement and with nothing else: no measurements, no heat. Without
 them it ends the heat a moment before the node would have to stop, since the node may have other tasks.
 """
@@ -25,7 +25,7 @@ from coordinator.heat.verify import HeaterCheck, VerifyOptions, default_options
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.fans.fan_unit import FanModule
 from coordinator.modules.heaters.control import ControlSettings
-from coordinator.modules.pinned import AHEAD_S, add_pinned
+from coordinator.modules.outputs.timing import AHEAD_S
 from coordinator.modules.sensors.temperature_input import SensorModule, TemperatureInput
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
@@ -35,23 +35,23 @@ from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
 
 LOOK_S: Final = 1.0
-"""How often it is looked whether there still are measurements."""
+"""How often it is checked that there still are measurements."""
 SILENT_LOOKS: Final = 2
-"""So many looks in a row may find none; looks and not seconds, as the host itself may have stood still."""
+"""How many checks in a row may find none; not a time, as the host itself may have been suspended."""
 
 STALE_LOOK_S: Final = 0.1
-"""How often it is looked whether the power rests upon a measurement that is too old."""
+"""How often it is checked whether the power is based on a measurement that is too old."""
 STALE_SPARE_S: Final = 0.2
-"""So long before the node would stop such a power is switched off: two looks."""
+"""How long before the node would stop such a power is switched off: two checks."""
 
 COMING_S: Final = 1.0
-"""Of filament that is going to pass, this long from when a power acts is provided for."""
+"""How far ahead filament that is going to pass is taken into account, from when a power acts."""
 BAD_MEASUREMENTS: Final = RANGE_CHECKS + 2
-"""So many out of range, and the node should have stopped by itself."""
+"""After this many out of range the node should have stopped by itself."""
 
 
 class Tuning(Protocol):
-    """A controller that finds out about its heater."""
+    """A controller that measures its heater."""
 
     @property
     def watched_c(self) -> float: ...  # noqa: D102
@@ -83,7 +83,7 @@ class Heater:
             # Counted from when a value takes effect, which is so long after it was sent.
             max_duration_s=build.get(MAX_DURATION) - AHEAD_S,
         )
-        add_pinned(build, self._output, pin)
+        build.add_device(pin.node, self._output, pin)
         self._find_fan = build.needed(COOLING_FAN, FanModule) if build.find(COOLING_FAN) else None
         ambient = build.find(AMBIENT_SENSOR)
         self._find_ambient = build.needed(AMBIENT_SENSOR, SensorModule) if ambient else None
@@ -103,10 +103,10 @@ class Heater:
         self._applied_s = 0.0
         """When power was applied last, host's time."""
         self._stale_s = build.get(MAX_DURATION) - AHEAD_S - STALE_SPARE_S
-        self._gone: str | None = None
+        self._off_because: str | None = None
         """Why the target was cleared; None: it was not."""
         self._bad = 0
-        self._told_s = 0.0
+        self._reported_s = 0.0
 
     # ---------------------------------------------------------------------------------------------- life
 
@@ -123,7 +123,7 @@ class Heater:
         self._check = HeaterCheck(options)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
+        """Start acting."""
         self._live = live
         if self.settings.kind == "mpc":
             live.machine.filament.want(self.name)
@@ -132,17 +132,17 @@ class Heater:
         live.every(STALE_LOOK_S, self._end_stale_heat)
 
     def keep(self, found: dict[str, str]) -> None:
-        """Have SAVE_CONFIG write what calibration FOUND: options of the section and their values."""
+        """Save what calibration FOUND with the next SAVE_CONFIG: options of the section and their values."""
         self.calibrated = found
         if self._live is not None:
             for option, text in found.items():
                 self._live.save(self.name, option, text)
 
     def end(self, cause: str) -> None:
-        """Act no more: the nodes have their outputs off."""
+        """Stop acting: the nodes have switched their outputs off."""
         self._live = None
         self.target_c = self.power = 0.0
-        self._tell_held(self._holding.end())
+        self._report_held(self._holding.end())
         self.input.end(cause)
 
     def status(self) -> Mapping[str, Value]:
@@ -181,7 +181,7 @@ class Heater:
 
         A calibration ends when its heater is switched off.
         """
-        self.target_c, self._gone = celsius, None
+        self.target_c, self._off_because = celsius, None
         if celsius <= 0:
             if self._tuning is not None:
                 self._end_tuning("it was switched off")
@@ -189,7 +189,7 @@ class Heater:
 
     @property
     def settled(self) -> bool:
-        """Whether who waits for the target may go on."""
+        """Whether a command that waits for the target may go on."""
         if self.target_c <= 0 or self.controller is None or self.input.celsius is None:
             return True
         return self.input.is_sound and self.controller.settled(self.input.celsius, self.target_c)
@@ -201,16 +201,19 @@ class Heater:
             await self._next()
 
     async def _next(self) -> None:
-        """Wait for the next measurement; raises CanductorError when a node went away meanwhile."""
+        """Wait for the next measurement; raises CanductorError when the heater was switched off meanwhile."""
         await self.input.next()
-        if self._gone is not None:
-            raise CanductorError(self._gone)
+        if self._off_because is not None:
+            raise CanductorError(self._off_because)
 
     async def tune(self, tuning: Tuning, each: Callable[[], None] = lambda: None) -> None:
-        """Let TUNING have the heater until it is done, EACH after every measurement; it is off then."""
+        """Control the heater by TUNING until that is done, then switch it off.
+
+        EACH is called after every measurement.
+        """
         if self._tuning is not None:
             raise CanductorError(f"[{self.name}] is being calibrated already; wait for its end")
-        self._tuning, self._tuning_failure, self._gone = tuning, None, None
+        self._tuning, self._tuning_failure, self._off_because = tuning, None, None
         try:
             while not tuning.is_done:
                 await self._next()
@@ -222,12 +225,12 @@ class Heater:
             self.set_target(0.0)
 
     def _end_tuning(self, why: str) -> None:
-        """Have the calibration fail, and heat no more."""
+        """End the calibration with an error, and switch off."""
         self._tuning_failure = CanductorError(f"the calibration of [{self.name}] ended: {why}")
         self.input.wake()
 
     def use(self, controller: Controller) -> None:
-        """Be controlled by another controller from now on."""
+        """Use another controller from now on."""
         self.controller = controller
 
     # ------------------------------------------------------------------------------------------- control
@@ -247,24 +250,24 @@ class Heater:
             return
         self._apply(self._wanted(live, at_s, celsius))
         ended = self._holding.measured(at_s, celsius, self.target_c, self.power, settled=self.settled)
-        self._tell_held(ended)
+        self._report_held(ended)
 
-    def _tell_held(self, held: Held | None) -> None:
+    def _report_held(self, held: Held | None) -> None:
         if held is not None and self.on_held is not None:
             self.on_held(held)
 
     def _out_of_range(self, live: "ModuleContext", celsius: float) -> None:
-        """Heat no more while what is measured cannot be; its node stops by itself a moment later."""
+        """Switch off while the measurement is out of range; its node stops by itself a moment later."""
         self._bad += 1
         self._apply(0.0)
         if self._bad > BAD_MEASUREMENTS:
             live.stop(
-                f"heater {self.key}: its sensor tells {celsius:.0f} °C, outside {self.input.min_c:g} to"
+                f"heater {self.key}: its sensor reads {celsius:.0f} °C, outside {self.input.min_c:g} to"
                 f" {self.input.max_c:g} °C; check the sensor and its wires"
             )
 
     def _wanted(self, live: "ModuleContext", at_s: float, celsius: float) -> float:
-        if self._gone is not None or self._tuning_failure is not None:
+        if self._off_because is not None or self._tuning_failure is not None:
             return 0.0
         if self._tuning is not None:
             try:
@@ -275,10 +278,10 @@ class Heater:
         if self.controller is None:
             return 0.0
         if isinstance(self.controller, Mpc):
-            self._tell_model(live, self.controller, at_s)
+            self._update_model(live, self.controller, at_s)
         return self.controller.power(at_s, celsius, self.target_c)
 
-    def _tell_model(self, live: "ModuleContext", model: Mpc, at_s: float) -> None:
+    def _update_model(self, live: "ModuleContext", model: Mpc, at_s: float) -> None:
         if self.fan is not None:
             model.set_fan(self.fan.unit.speed)
         if self._ambient is not None and self._ambient.input.celsius is not None:
@@ -287,13 +290,13 @@ class Heater:
             forecast = live.machine.filament
             acts_s = at_s + AHEAD_S
             model.set_filament(
-                forecast.mm_per_s(self.name, self._told_s, at_s),
+                forecast.mm_per_s(self.name, self._reported_s, at_s),
                 forecast.mm_per_s(self.name, acts_s, acts_s + COMING_S),
             )
-            self._told_s = at_s
+            self._reported_s = at_s
 
     def _apply(self, power: float) -> None:
-        """Have POWER on the node; off needs no renewal."""
+        """Set POWER on the node; off needs no renewal."""
         live, self.power = self._live, power
         if live is None or (power <= 0 and not self._on):
             return
@@ -302,37 +305,37 @@ class Heater:
             clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)
             self._output.set(node, clock, power)
         except CanductorError as error:
-            self._let_go(str(error))
+            self._switch_off(str(error))
             return
         self._on, self._applied_s = power > 0, live.now_s()
 
     def _end_stale_heat(self) -> None:
-        """Switch off when no measurement has renewed the power for long: nobody knows how hot it is."""
+        """Switch off when no measurement has renewed the power for too long: the temperature is unknown."""
         live = self._live
         if live is not None and self._on and live.now_s() - self._applied_s > self._stale_s:
             self._apply(0.0)
 
     def _look(self) -> None:
-        """Notice that there are no measurements any more, and what that means."""
+        """Check that there still are measurements; stop the machine, or switch off, if there are none."""
         live = self._live
         if live is None or (self.target_c <= 0 and self._tuning is None):
             return
         for name in (self.input.node, self.node):
             if live.node(name).state is not NodeState.READY:
-                self._let_go(f"node {name} is {live.node(name).state.value}")
+                self._switch_off(f"node {name} is {live.node(name).state.value}")
                 return
         missed = self.input.missed()
         if missed > SILENT_LOOKS:
             live.stop(
-                f"heater {self.key}: its sensor has not said anything for some {missed * LOOK_S:g} s;"
+                f"heater {self.key}: its sensor has been silent for about {missed * LOOK_S:g} s;"
                 f" check node {self.input.node} and its wires"
             )
 
-    def _let_go(self, why: str) -> None:
-        """Clear the target: a node that may be absent is away, its own or that of its sensor."""
+    def _switch_off(self, why: str) -> None:
+        """Clear the target: the node of the heater or of its sensor, which may be absent, is gone."""
         live, was, on = self._live, self.target_c, self._on
         self.target_c, self.power, self._on = 0.0, 0.0, False
-        self._gone = f"heater {self.key} went off: {why}"
+        self._off_because = f"heater {self.key} was turned off: {why}"
         if on and live is not None and live.node(self.node).state is NodeState.READY:
             with contextlib.suppress(CanductorError):  # then its own max_duration ends it
                 clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)

@@ -1,18 +1,17 @@
 """What all heaters and sensors have in common: their names, and the commands for any of them."""
 
 from collections.abc import Awaitable, Callable, Mapping
-from typing import ClassVar, Final
+from typing import Final
 
-from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading, Synchronized
+from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading, Synchronized
 from coordinator.gcode.events import Done
+from coordinator.gcode.parameters import numbers, one, value
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.tuning import calibrate_mpc, calibrate_pid
 from coordinator.modules.sensors.temperature_source import TemperatureSource
-from coordinator.modules.words import numbers, one, parameters, value
 from coordinator.support.values import Value
 
 FAN_STEPS_MAX: Final = 12
@@ -21,22 +20,20 @@ FAN_STEPS_MAX: Final = 12
 class HeaterRegistry(Module):
     """The heaters and temperature sensors of the machine, and the commands for any of them."""
 
-    SPEC: ClassVar = SectionSpec(help="What all heaters have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "heaters"
         self.units: dict[str, Heater] = {}
-        """By what programs call them: extruder, heater_bed, NAME of heater_generic."""
+        """By the name in programs: extruder, heater_bed, NAME of heater_generic."""
         self.sensors: dict[str, TemperatureSource] = {}
-        """By what programs call them: heaters and the sections of sensors."""
+        """By the name in programs: heaters and the sections of sensors."""
         self._tags: dict[str, Heater | TemperatureSource] = {}
         for name, help_, read in (
-            ("M105", "Report all temperatures", self._tell),
-            ("TURN_OFF_HEATERS", "Let all heaters cool down", self._turn_off),
+            ("M105", "Report all temperatures", self._report),
+            ("TURN_OFF_HEATERS", "Turn all heaters off", self._turn_off),
             ("SET_HEATER_TEMPERATURE", "Set a heater's target: HEATER= TARGET=", self._set),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
         for name, help_, read in (
             (
                 "TEMPERATURE_WAIT",
@@ -44,17 +41,17 @@ class HeaterRegistry(Module):
                 self._wait,
             ),
             ("QUERY_ADC", "Report what a sensor's converter reads: NAME= PULLUP=", self._query),
-            ("PID_CALIBRATE", "Find a heater's PID constants: HEATER= TARGET=", self._pid),
+            ("PID_CALIBRATE", "Calibrate a heater's PID constants: HEATER= TARGET=", self._pid),
             (
                 "MPC_CALIBRATE",
-                "Find a heater's model: HEATER= TARGET= FAN_BREAKPOINTS=",
+                "Calibrate a heater's model: HEATER= TARGET= FAN_BREAKPOINTS=",
                 self._mpc,
             ),
         ):
-            build.add_command(GCodeCommand(name, help_, read))
+            build.add_command(name, help_, read)
 
     def add(self, unit: Heater, tag: str = "") -> None:
-        """Take a heater on; TAG is what M105 calls it."""
+        """Register a heater; TAG is its name in M105."""
         self.units[unit.key] = unit
         self.sensors[unit.key] = unit.input
         if unit.name != unit.key:
@@ -62,7 +59,7 @@ class HeaterRegistry(Module):
         self._tags[tag or unit.key] = unit
 
     def add_sensor(self, source: TemperatureSource, tag: str = "") -> None:
-        """Take a sensor on that belongs to no heater."""
+        """Register a sensor that belongs to no heater; TAG is its name in M105."""
         self.sensors[source.name] = source
         if tag:
             self._tags[tag] = source
@@ -82,7 +79,7 @@ class HeaterRegistry(Module):
     # ------------------------------------------------------------------------------------------ commands
 
     def temperatures(self) -> str:
-        """Return all temperatures as hosts ask for them: ``B:60.0 /60.0 T0:200.1 /200.0``."""
+        """Return all temperatures as hosts expect them: ``B:60.0 /60.0 T0:200.1 /200.0``."""
         parts = []
         for tag in sorted(self._tags):
             found = self._tags[tag]
@@ -92,7 +89,7 @@ class HeaterRegistry(Module):
             parts.append(f"{tag}:{celsius:.1f} /{target:.1f}")
         return " ".join(parts) or "T:0"
 
-    def set_in_time(self, unit: Heater, celsius: float) -> Synchronized:
+    def set_target(self, unit: Heater, celsius: float) -> Synchronized:
         """Return what sets a target without waiting; WordError for one it cannot have."""
         unit.check_target(celsius)
         return Synchronized(lambda _: unit.set_target(celsius))
@@ -109,12 +106,12 @@ class HeaterRegistry(Module):
 
         return AtStandstill(perform)
 
-    def _tell(self, call: Call) -> Reading:
+    def _report(self, call: Call) -> Reading:
         numbers(call.command, "T")
         return Immediate((self.temperatures(),), kind=ReplyKind.PLAIN)
 
     def _turn_off(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(_: float) -> None:
             for unit in self.units.values():
@@ -127,12 +124,12 @@ class HeaterRegistry(Module):
         return names[one(call.command, given, "HEATER", names)]
 
     def _set(self, call: Call) -> Reading:
-        given = parameters(call.command, ("HEATER", "TARGET"))
-        return self.set_in_time(self._unit(call, given), value(call.command, given, "TARGET", 0.0))
+        given = call.parameters("HEATER", "TARGET")
+        return self.set_target(self._unit(call, given), value(call.command, given, "TARGET", 0.0))
 
     def _wait(self, call: Call) -> Reading:
         command = call.command
-        given = parameters(command, ("SENSOR", "MINIMUM", "MAXIMUM"))
+        given = call.parameters("SENSOR", "MINIMUM", "MAXIMUM")
         source = self.sensors[one(command, given, "SENSOR", self.sensors)]
         if not given.keys() & {"MINIMUM", "MAXIMUM"}:
             raise WordError("TEMPERATURE_WAIT needs MINIMUM= or MAXIMUM=, or both")
@@ -149,7 +146,7 @@ class HeaterRegistry(Module):
         return AtStandstill(perform)
 
     def _query(self, call: Call) -> Reading:
-        given = parameters(call.command, ("NAME", "PULLUP"))
+        given = call.parameters("NAME", "PULLUP")
         names = [name for name, source in self.sensors.items() if source.ratio is not None]
         if "NAME" not in given:
             return Immediate(
@@ -157,20 +154,20 @@ class HeaterRegistry(Module):
             )
         name = one(call.command, given, "NAME", names)
         ratio = self.sensors[name].ratio or 0.0
-        told = f"{name}: {ratio:.6f} of full scale"
+        text = f"{name}: {ratio:.6f} of full scale"
         if "PULLUP" in given:
             ohms = value(call.command, given, "PULLUP")
             below = f"{ohms * ratio / (1 - ratio):.1f} Ω" if ratio < 1 else "no resistor"
-            told += f", with {ohms:g} Ω above it {below}"
-        return Immediate((told,))
+            text += f", with {ohms:g} Ω above it {below}"
+        return Immediate((text,))
 
     def _pid(self, call: Call) -> Reading:
-        given = parameters(call.command, ("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE"))
+        given = call.parameters("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE")
         unit, target = self._unit(call, given), value(call.command, given, "TARGET")
         return self._calibration(unit, target, lambda: calibrate_pid(unit, target))
 
     def _mpc(self, call: Call) -> Reading:
-        given = parameters(call.command, ("HEATER", "TARGET", "FAN_BREAKPOINTS"))
+        given = call.parameters("HEATER", "TARGET", "FAN_BREAKPOINTS")
         unit, target = self._unit(call, given), value(call.command, given, "TARGET", 200.0)
         steps = round(value(call.command, given, "FAN_BREAKPOINTS", 3.0))
         if not 2 <= steps <= FAN_STEPS_MAX:

@@ -6,15 +6,14 @@ from typing import ClassVar, Final
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.config.sections.heater_options import PID_KD, PID_KI, PID_KP
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading, Synchronized
+from coordinator.gcode.commands import Call, Immediate, Reading, Synchronized
+from coordinator.gcode.parameters import one, value
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.heaters import HeaterRegistry
-from coordinator.modules.words import one, parameters, value
-from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest, shown
+from coordinator.support.quoting import nearest_or_all, shown
 from coordinator.support.values import Value
 
 KIND: Final = "pid_profile"
@@ -39,35 +38,24 @@ GAINS: Final = ("KP", "KI", "KD")
 class PidProfiles(Module):
     """The profiles of all heaters, and PID_PROFILE."""
 
-    SPEC: ClassVar = SectionSpec(help="What profiles have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "pid_profile"
         self._heaters = build.shared(HeaterRegistry)
         self._of: dict[str, dict[str, PidGains]] = {}
         self._loaded: dict[str, str] = {}
-        self._live: ModuleContext | None = None
         build.add_command(
-            GCodeCommand(
-                "PID_PROFILE",
-                "LOAD=, SAVE= or SET_VALUES= a profile of HEATER=, or GET_VALUES=1",
-                self._read,
-            )
+            "PID_PROFILE", "LOAD=, SAVE= or SET_VALUES= a profile of HEATER=, or GET_VALUES=1", self._read
         )
 
     def add(self, heater: str, name: str, gains: PidGains) -> None:
-        """Take a profile on; HEATER is what programs call it."""
+        """Add a profile; HEATER is its name in programs."""
         self._of.setdefault(heater, {})[name] = gains
 
     def heater(self, name: str) -> Heater | None:
         """Return the heater that programs or sections call NAME."""
         units = self._heaters.units.values()
         return next((unit for unit in units if name in (unit.key, unit.name)), None)
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
-        self._live = live
 
     def status(self) -> Mapping[str, Value]:
         """Report which profile each heater has; those that have none are left out."""
@@ -76,7 +64,7 @@ class PidProfiles(Module):
     def _read(self, call: Call) -> Reading:
         command = call.command
         known = (*ACTIONS, *GAINS, "HEATER", "KEEP_TARGET", "VERBOSE", "DEFAULT", "TARGET", "TOLERANCE")
-        given = parameters(command, known)
+        given = call.parameters(*known)
         actions = [action for action in ACTIONS if action in given]
         if len(actions) != 1:
             raise WordError(f"PID_PROFILE needs one of {', '.join(ACTIONS)}")
@@ -84,7 +72,7 @@ class PidProfiles(Module):
         (action,) = actions
         name = given[action]
         if action == "GET_VALUES":
-            return Immediate((self._told(unit),))
+            return Immediate((self._report(unit),))
         if action == "REMOVE":
             raise WordError("a profile is removed by hand: delete its section from the configuration")
         if unit.settings.kind != "pid":
@@ -105,7 +93,7 @@ class PidProfiles(Module):
             gains = self._find(unit, name)
         if gains is None:
             names = [DEFAULT, *self._of.get(unit.key, {})]
-            hint = nearest(name, names) or f"; there is {', '.join(names)}"
+            hint = nearest_or_all(name, names)
             raise WordError(f"PID_PROFILE: {unit.key} has no profile {quoted(name)}{hint}")
         return self._use(call, given, unit, name, gains)
 
@@ -146,7 +134,7 @@ class PidProfiles(Module):
             texts = {"control": "pid", **_texts(controller.gains)}
             for option, text in texts.items():
                 live.save(f"{KIND} {unit.key} {name}", option, text)
-            live.say(f"profile {name} of {unit.key} is there from now on; SAVE_CONFIG writes it")
+            live.say(f"profile {name} of {unit.key} was saved; SAVE_CONFIG writes it")
 
         return Synchronized(act)
 
@@ -155,7 +143,7 @@ class PidProfiles(Module):
         if name not in own and len(own) >= PROFILES_MAX:
             raise WordError(f"{unit.key} has {PROFILES_MAX} profiles already; load one of them")
 
-    def _told(self, unit: Heater) -> str:
+    def _report(self, unit: Heater) -> str:
         if not isinstance(unit.controller, Pid):
             return f"{unit.key} is not controlled by PID"
         values = " ".join(f"{option}: {text}" for option, text in _texts(unit.controller.gains).items())
@@ -170,6 +158,7 @@ def _texts(gains: PidGains) -> dict[str, str]:
 class PidProfile(Module):
     """One profile of one heater."""
 
+    KIND = "pid_profile"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="PID constants of a heater for other circumstances: [pid_profile HEATER NAME], and PID_PROFILE"

@@ -11,14 +11,14 @@ from coordinator.config.sections.heater_options import (
     MIN_EXTRUDE_TEMP,
     UNSUPPORTED_HEATER_OPTIONS,
 )
-from coordinator.gcode.commands import Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, Reading
+from coordinator.gcode.parameters import numbers
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.heaters.pid_profile import PidProfiles
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
-from coordinator.modules.words import numbers
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
@@ -38,16 +38,12 @@ class HeaterSection(Module):
         self.unit.link(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
+        """Start acting."""
         await self.unit.connect(live)
 
-    def stopped(self, cause: str) -> None:
-        """Act no more."""
+    def end(self, cause: str) -> None:
+        """Stop acting."""
         self.unit.end(cause)
-
-    def close(self) -> None:
-        """Act no more."""
-        self.unit.end("the machine was closed")
 
     def status(self) -> Mapping[str, Value]:
         """Report how the heater is."""
@@ -57,17 +53,18 @@ class HeaterSection(Module):
 class HeaterBed(HeaterSection):
     """The heater of the bed."""
 
+    KIND = "heater_bed"
     SPEC: ClassVar = SectionSpec(
         help="The heated bed", options=HEATER_OPTIONS, unsupported=UNSUPPORTED_HEATER_OPTIONS
     )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build, "heater_bed", "B")
-        build.add_command(GCodeCommand("M140", "Set the bed's target: S", self._set, while_printing=True))
-        build.add_command(GCodeCommand("M190", "Set the bed's target and wait for it: S or R", self._wait))
+        build.add_command("M140", "Set the bed's target: S", self._set, while_printing=True)
+        build.add_command("M190", "Set the bed's target and wait for it: S or R", self._wait)
 
     def _set(self, call: Call) -> Reading:
-        return self.heaters.set_in_time(self.unit, _target(call, "S"))
+        return self.heaters.set_target(self.unit, _target(call, "S"))
 
     def _wait(self, call: Call) -> Reading:
         return self.heaters.set_and_wait(self.unit, _target(call, "SR"))
@@ -76,6 +73,7 @@ class HeaterBed(HeaterSection):
 class HeaterGeneric(HeaterSection):
     """A heater of any kind."""
 
+    KIND = "heater_generic"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A heater for anything else; programs call it by NAME",
@@ -90,23 +88,17 @@ class HeaterGeneric(HeaterSection):
 class ExtruderHeaterCommands(Module):
     """The heaters of all extruders, and the commands for them."""
 
-    SPEC: ClassVar = SectionSpec(help="What the heaters of extruders have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         build.shared(PidProfiles)
         self.by_extruder: dict[str, ExtruderHeaterSection] = {}
         self._extruders = [extruder.name for extruder in build.machine.extruders]
         self.heaters = build.shared(HeaterRegistry)
-        build.add_command(
-            GCodeCommand("M104", "Set an extruder's target: S, T", self._set, while_printing=True)
-        )
-        build.add_command(
-            GCodeCommand("M109", "Set an extruder's target and wait for it: S or R, T", self._wait)
-        )
+        build.add_command("M104", "Set an extruder's target: S, T", self._set, while_printing=True)
+        build.add_command("M109", "Set an extruder's target and wait for it: S or R, T", self._wait)
 
     def _set(self, call: Call) -> Reading:
-        return self.heaters.set_in_time(self._unit(call), _target(call, "ST"))
+        return self.heaters.set_target(self._unit(call), _target(call, "ST"))
 
     def _wait(self, call: Call) -> Reading:
         return self.heaters.set_and_wait(self._unit(call), _target(call, "SRT"))
@@ -130,6 +122,7 @@ class ExtruderHeaterCommands(Module):
 class ExtruderHeaterSection(Module):
     """The heater of an extruder; an extruder without heater_pin has none."""
 
+    READS = r"extruder[0-9]*"
     TITLE: ClassVar = "[extruder], [extruder1] …"
     SPEC: ClassVar = SectionSpec(
         help="The heater of an extruder",
@@ -140,7 +133,6 @@ class ExtruderHeaterSection(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.unit: Heater | None = None
-        self._connected = False
         self.min_extrude_c = build.get(MIN_EXTRUDE_TEMP)
         if build.find(HEATER_PIN) is None:
             return
@@ -155,24 +147,20 @@ class ExtruderHeaterSection(Module):
             self.unit.link(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
+        """Start acting."""
         if self.unit is not None:
             await self.unit.connect(live)
-            self._connected = True
+            await super().connect(live)
 
-    def stopped(self, cause: str) -> None:
-        """Act no more."""
+    def end(self, cause: str) -> None:
+        """Stop acting."""
         if self.unit is not None:
             self.unit.end(cause)
-
-    def close(self) -> None:
-        """Act no more."""
-        self.stopped("the machine was closed")
 
     @property
     def too_cold(self) -> bool:
         """Whether it is connected and too cold; one that is only planned with is not."""
-        return self._connected and not self.can_extrude
+        return self._live is not None and not self.can_extrude
 
     @property
     def can_extrude(self) -> bool:

@@ -1,4 +1,4 @@
-"""Calibrates a heater: runs the tuning, uses what was found, and says what to write down."""
+"""Calibrates a heater: runs the tuning, uses the result, and saves and reports it."""
 
 from coordinator.gcode.events import Done
 from coordinator.heat.mpc_tune import MpcTune
@@ -17,7 +17,7 @@ async def calibrate_pid(unit: Heater, target_c: float) -> Done:
     if unit.settings.kind == "pid":
         unit.use(unit.settings.by_pid(gains))
     found = (("control", "pid"), ("pid_kp", gains.kp), ("pid_ki", gains.ki), ("pid_kd", gains.kd))
-    return _told(unit, found)
+    return _report(unit, found)
 
 
 async def calibrate_mpc(unit: Heater, target_c: float, fan_steps: int) -> Done:
@@ -50,10 +50,10 @@ async def calibrate_mpc(unit: Heater, target_c: float, fan_steps: int) -> Done:
     if model.fan_transfer_w_per_k:
         transfers = ", ".join(f"{value:.6g}" for value in model.fan_transfer_w_per_k)
         found = (*found, ("fan_ambient_transfer", transfers))
-    return _told(unit, found)
+    return _report(unit, found)
 
 
-def _told(unit: Heater, found: tuple[tuple[str, str | float], ...]) -> Done:
+def _report(unit: Heater, found: tuple[tuple[str, str | float], ...]) -> Done:
     texts = {name: value if isinstance(value, str) else f"{value:.6g}" for name, value in found}
     unit.keep(texts)
     lines = (f"{name}: {text}" for name, text in texts.items())

@@ -1,4 +1,4 @@
-"""[verify_heater NAME]: how strict the watch over a heater is."""
+"""[verify_heater NAME]: limits of the check that a heater heats."""
 
 from typing import ClassVar, Final
 
@@ -7,11 +7,11 @@ from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.heat.verify import VerifyOptions, default_options
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heaters import HeaterRegistry
-from coordinator.support.quoting import nearest
+from coordinator.support.quoting import nearest_or_all
 
 MAX_ERROR: Final = FloatOption(
     name="max_error",
-    help="how much K·s below the range of the target may gather before all is stopped",
+    help="how much K·s below the range of the target may add up before the machine is stopped",
     default=120.0,
     unit="K·s",
     minimum=0,
@@ -27,7 +27,7 @@ CHECK_GAIN_TIME: Final = FloatOption(
 )
 HYSTERESIS: Final = FloatOption(
     name="hysteresis",
-    help="this near to its target a heater is in range",
+    help="range around the target",
     default=5.0,
     unit="K",
     minimum=0,
@@ -35,7 +35,7 @@ HYSTERESIS: Final = FloatOption(
 )
 HEATING_GAIN: Final = FloatOption(
     name="heating_gain",
-    help="how much hotter it has to get in check_gain_time",
+    help="by how much the temperature has to rise in check_gain_time",
     default=2.0,
     unit="K",
     above=0,
@@ -44,12 +44,13 @@ HEATING_GAIN: Final = FloatOption(
 
 
 class VerifyHeater(Module):
-    """How the heater of the section's instance is watched."""
+    """The limits of the heater that the section is named after."""
 
+    KIND = "verify_heater"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="The watch over a heater (extruder, heater_bed or the name of a heater_generic); every heater"
-        " has it, the section only changes its values",
+        help="Limits of the check that a heater (extruder, heater_bed or the name of a heater_generic) heats;"
+        " every heater is checked, the section only changes the limits",
         options=(MAX_ERROR, CHECK_GAIN_TIME, HYSTERESIS, HEATING_GAIN),
     )
 
@@ -71,7 +72,7 @@ class VerifyHeater(Module):
         if self.heater not in known:
             if modules.is_left_out(self.heater):
                 raise NotSupported(self.place, f"the heater {self.heater} is not supported yet")
-            hint = nearest(self.heater, known) or f"; there is {', '.join(known) or 'none'}"
+            hint = nearest_or_all(self.heater, known)
             raise ConfigError(self.place, f"[{self.name}] refers to an unknown heater{hint}")
         assert heaters is not None
         heaters.units[self.heater].watch(self.options)

@@ -13,8 +13,7 @@ from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import RailDescription
-from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.kinematics.base import Point
@@ -22,7 +21,6 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing_plan import AXES, Approach, approaches, landed, second_landed
 from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
 from coordinator.runtime.machine import Machine
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.homing import HomingMove, HomingResult
 from coordinator.runtime.moves.single import Ramp, SingleMove
 from coordinator.runtime.moves.straight import move_by
@@ -39,58 +37,49 @@ ReadHome = Callable[[Call, str], Reading]
 class Homing(Module):
     """Homes the machine that it is built for."""
 
-    SPEC = SectionSpec(help="Homing", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "query_endstops"
         self._described = build.machine
         self._last_query: dict[str, bool] = {}
         self._approaches = approaches(build.machine)
-        self._live: ModuleContext | None = None
         self._feelers: dict[str, StallEndstop] = {}
         """By virtual endstop."""
         self.instead: Callable[[Call, str], Reading] | None = None
-        """Reads G28 in its place; a G28 among the lines that it stands for is homing again."""
+        """Reads G28 instead; a G28 among the lines that replace it homes."""
         self.corrected: Callable[[ReadHome], ReadHome] | None = None
-        """What homing finds, for programs whose X Y Z are not those of the axes."""
-        build.add_command(GCodeCommand("M119", "Report which endstops are pressed", self._read_query))
-        build.add_command(
-            GCodeCommand("QUERY_ENDSTOPS", "Report which endstops are pressed", self._read_query)
-        )
+        """Converts the result of homing, for programs whose X Y Z are not those of the axes."""
+        build.add_command("M119", "Report which endstops are pressed", self._read_query)
+        build.add_command("QUERY_ENDSTOPS", "Report which endstops are pressed", self._read_query)
 
     def status(self) -> Mapping[str, Value]:
-        """Report which endstops were pressed when somebody asked last."""
+        """Report which endstops were pressed at the last query."""
         return {"last_query": dict(self._last_query)}
 
     @property
     def acts(self) -> bool:
-        """Whether there is any endstop that it can look for."""
+        """Whether there is any endstop to home to."""
         return self.instead is not None or any(
             approach.possible or self._refusal(approach) for approach in self._approaches
         )
 
     def replace_by(self, read: Callable[[Call, str], Reading], build: Build) -> None:
-        """Have READ read G28, for the section that BUILD is of; raises ConfigError when another does."""
+        """Let READ read G28, for the section of BUILD; raises ConfigError when another section does."""
         if self.instead is not None:
             raise ConfigError(
                 build.place,
-                f"[{build.name}] and another section both say what G28 does; remove one:"
+                f"[{build.name}] and another section both replace G28; remove one:"
                 " [homing_override] can do what [safe_z_home] does",
             )
         self.instead = read
 
     def link(self, modules: Modules) -> None:
-        """Find the drivers that are to feel the end of an axis."""
+        """Find the drivers for sensorless homing."""
         for rail in (rail for approach in self._approaches for rail in approach.rails):
             virtual = rail.homing.virtual_endstop
             found = modules.find(section_of(virtual), StallEndstop) if virtual else None
             if found is not None:
                 self._feelers[virtual] = found
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
 
     def read(self, call: Call, axes: str) -> Reading:
         """Read G28 of AXES (letters)."""
@@ -107,7 +96,7 @@ class Homing(Module):
                 raise CanductorError(f"G28 of {approach.letters} is refused: {why}")
 
     def _refusal(self, approach: Approach) -> str:
-        """Say why nobody would know where the axes of APPROACH are after it; empty: it may be."""
+        """Return why the axes of APPROACH cannot be homed; empty: they can."""
         for rail in approach.rails:
             if rail.homing.refused:
                 return rail.homing.refused
@@ -170,7 +159,7 @@ class Homing(Module):
     async def _come_within(self, place: "Point", letters: str) -> "Point":
         """Move axes that stopped behind their endstop beyond their range back into it; return where they are.
 
-        By a step more than needed, as a way is made in whole steps. Towers and arms end within their space.
+        By a step more than needed, as moves are made of whole steps. Towers and arms end within their space.
         """
         described = self._described
         if self._live is None or not described.kinematics.straight:
@@ -244,8 +233,8 @@ class Homing(Module):
     async def _query(self) -> Done:
         rails = self._described.stops
         self._last_query = {rail.axis: await self._pressed(rail) for rail in rails}
-        told = [f"{axis}:{'pressed' if pressed else 'open'}" for axis, pressed in self._last_query.items()]
-        return Done((" ".join(told) or "this machine has no endstops on pins",), kind=ReplyKind.PLAIN)
+        states = [f"{axis}:{'pressed' if pressed else 'open'}" for axis, pressed in self._last_query.items()]
+        return Done((" ".join(states) or "this machine has no endstops on pins",), kind=ReplyKind.PLAIN)
 
     async def _any_pressed(self, rails: Sequence["RailDescription"]) -> bool:
         return any([await self._pressed(rail) for rail in rails])
@@ -257,6 +246,4 @@ class Homing(Module):
 
     @property
     def _machine(self) -> "Machine":
-        if self._live is None:
-            raise CanductorError("homing needs a machine that is connected")
-        return self._live.machine
+        return self.live.machine

@@ -1,19 +1,19 @@
-"""[homing_override]: a template of g-code in the place of G28. A G28 in it is the machine's own."""
+"""[homing_override]: a template of g-code that replaces G28. A G28 in it is the machine's own."""
 
 from dataclasses import replace
 from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec, TextOption
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Lines, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Lines, Reading
 from coordinator.gcode.events import Done
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.programs.gcode_macro import GCodeTemplate, parameters
 
-GCODE: Final = GCodeOption(name="gcode", help="what is done instead of G28, a template; a G28 in it homes")
+GCODE: Final = GCodeOption(name="gcode", help="what is run instead of G28, a template; a G28 in it homes")
 AXES: Final = TextOption(
     name="axes",
-    help="letters of the axes for which it is done; G28 of others homes",
+    help="letters of the axes for which it is run; G28 of others homes",
     default="xyz",
     pattern=r"[xyzXYZ]+",
     pattern_rule="letters of x, y and z",
@@ -21,7 +21,7 @@ AXES: Final = TextOption(
 SET: Final = tuple(
     FloatOption(
         name=f"set_position_{axis}",
-        help=f"what {axis.upper()} is taken to be before the lines are run; by default it stays unknown",
+        help=f"what {axis.upper()} is set to before the lines are run; by default it stays unknown",
         unit="mm",
         minimum=-100_000,
         maximum=100_000,
@@ -33,9 +33,10 @@ _LINES: Final = "_HOMING_OVERRIDE_LINES"
 
 
 class HomingOverride(Module):
-    """What G28 does in its place."""
+    """The lines that replace G28."""
 
-    SPEC = SectionSpec("G28 is done by these lines of g-code", (GCODE, AXES, *SET))
+    KIND = "homing_override"
+    SPEC = SectionSpec("G28 is replaced by these lines of g-code", (GCODE, AXES, *SET))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -45,16 +46,16 @@ class HomingOverride(Module):
         self._sets = any(value is not None for value in self._set)
         if self._sets:
             build.add_command(
-                GCodeCommand(_SET_POSITION, "Begin what stands in for G28", self._read_set_position)
+                _SET_POSITION, "Set the position before the lines that replace G28", self._read_set_position
             )
-            build.add_command(GCodeCommand(_LINES, "Go on with it", self._read_lines))
+            build.add_command(_LINES, "Run the lines that replace G28", self._read_lines)
         self._homing = build.shared(Homing)
         self._homing.replace_by(self._read, build)
 
     def _read(self, call: Call, axes: str) -> Reading:
         if not self._axes & set(axes):
             return self._homing.read(replace(call, callers=(*call.callers, "G28")), axes)
-        if self._sets:  # the template is to see the position that is set
+        if self._sets:  # the template sees the position that was set
             return Lines(f"{_SET_POSITION}\n{_LINES} {call.command.text.strip()}")
         return self._read_lines(call)
 

@@ -1,17 +1,16 @@
-"""[safe_z_home]: Z is homed at a place of its own, with the head lifted before anything moves sideways."""
+"""[safe_z_home]: Z is homed at a given X and Y, and the head is lifted before it moves there."""
 
 from dataclasses import dataclass, replace
 from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
-from coordinator.config.sections.bounds import MAX_SPEED
+from coordinator.config.sections.bounds import speed_option
 from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import Homing
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.straight import move_by
 from nodes.support.errors import CanductorError
 
@@ -39,10 +38,8 @@ class PlaceOption(Option[tuple[float, float]]):
         return (0.0, 0.0)
 
 
-PLACE: Final = PlaceOption(name="home_xy_position", help="where the head is when Z is homed", unit="mm")
-SPEED: Final = FloatOption(
-    name="speed", help="of the way there", default=50.0, unit="mm/s", above=0, maximum=MAX_SPEED
-)
+PLACE: Final = PlaceOption(name="home_xy_position", help="position of the head while Z is homed", unit="mm")
+SPEED: Final = speed_option("speed", "of the way there", 50.0)
 Z_HOP: Final = FloatOption(
     name="z_hop",
     help="how far the head is lifted before any axis is homed, and its height afterwards; 0: not at all",
@@ -51,21 +48,20 @@ Z_HOP: Final = FloatOption(
     minimum=0,
     maximum=HOP_MAX_MM,
 )
-Z_HOP_SPEED: Final = FloatOption(
-    name="z_hop_speed", help="of the lift", default=15.0, unit="mm/s", above=0, maximum=MAX_SPEED
-)
+Z_HOP_SPEED: Final = speed_option("z_hop_speed", "of the lift", 15.0)
 BACK: Final = BoolOption(
     name="move_to_previous",
-    help="whether X and Y go back to where they were before Z was homed",
+    help="whether X and Y move back to where they were before Z was homed",
     default=False,
 )
 
 
 class SafeZHome(Module):
-    """What G28 does in its place."""
+    """Replaces G28."""
 
+    KIND = "safe_z_home"
     SPEC = SectionSpec(
-        "G28 homes Z at one place of the bed, behind X and Y",
+        "G28 homes Z at one position of the bed, after X and Y",
         (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK),
         unsupported=("home_y_before_x",),
     )
@@ -76,7 +72,6 @@ class SafeZHome(Module):
         self._speed, self._hop_speed = build.get(SPEED), build.get(Z_HOP_SPEED)
         self._hop_mm, self._back = build.get(Z_HOP), build.get(BACK)
         self._limits = build.machine.limits
-        self._live: ModuleContext | None = None
         kinematics = build.machine.kinematics
         if not kinematics.straight:
             raise ConfigError(
@@ -97,10 +92,6 @@ class SafeZHome(Module):
                 x, y = self._place
                 return f"{x:g}, {y:g}, but {'XY'[axis]} goes from {low:g} to {high:g} mm"
         return ""
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
 
     def _read(self, call: Call, axes: str) -> Reading:
         missing = "".join(axis for axis in "XY" if axis not in call.homed + axes)
@@ -144,8 +135,7 @@ class SafeZHome(Module):
 
     async def _move(self, call: Call, way: tuple[float, float, float], speed: float, accel: float) -> Call:
         """Move by WAY; return CALL with the place that this led to, by the steps that were made."""
-        assert self._live is not None
-        x, y, z = await move_by(self._live.machine, way, speed, accel)
+        x, y, z = await move_by(self.live.machine, way, speed, accel)
         at = call.position
         return replace(call, position=(at[0] + x, at[1] + y, at[2] + z, at[3]))
 

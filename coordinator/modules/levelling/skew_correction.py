@@ -1,7 +1,7 @@
 """[skew_correction]: axes that do not stand at right angles to each other.
 
 What a program calls X Y Z is made by axes that lean: X = x + xy·y + xz·z, Y = y + yz·z for steppers that
-believe to be at x, y, z. So steppers follow the other way round: it is a change of what each of them follows.
+are driven to x, y, z. Steppers follow the inverse: the correction changes the weights of each of them.
 """
 
 import math
@@ -15,18 +15,17 @@ from coordinator.gcode.builtins.machine import come_to_standstill
 from coordinator.gcode.commands import (
     AtStandstill,
     Call,
-    GCodeCommand,
     Immediate,
     Position,
+    ProgramAction,
     ProgramContext,
     Reading,
-    ToProgram,
 )
 from coordinator.gcode.events import Done, PositionSet, WeightsChange
+from coordinator.gcode.parameters import flag, one, value
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing import Homing
-from coordinator.modules.words import flag, one, parameters, value
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
@@ -59,12 +58,12 @@ class Skew:
     yz: float = 0.0
 
     def made(self, at: Position) -> Position:
-        """Return where the head is when steppers believe to be AT."""
+        """Return where the head is when steppers are driven to AT."""
         x, y, z, e = at
         return (x + self.xy * y + self.xz * z, y + self.yz * z, z, e)
 
     def wanted(self, at: Position) -> Position:
-        """Return where steppers have to believe to be for the head to be AT."""
+        """Return where steppers have to be driven to for the head to be AT."""
         x, y, z, e = at
         y -= self.yz * z
         return (x - self.xy * y - self.xz * z, y, z, e)
@@ -78,6 +77,7 @@ class Skew:
 class SkewCorrection(Module):
     """A profile; the plain section has none."""
 
+    KIND = "skew_correction"
     SPEC = SectionSpec(
         "Axes that are not at right angles; [skew_correction NAME] is a profile", tuple(OPTIONS.values())
     )
@@ -99,9 +99,7 @@ class SkewCorrection(Module):
 
 
 class Skews(Module):
-    """The commands, and what holds."""
-
-    SPEC = SectionSpec("Commands about skew", ())
+    """The commands, and the skew in effect."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -109,31 +107,22 @@ class Skews(Module):
         self.straight: Mapping[str, Position] = {}
         """What each motor follows without any correction."""
         self.now = Skew()
-        """What holds for the lines to come."""
+        """The skew that is corrected for the lines to come."""
         self._profile = ""
         self._profiles: dict[str, Skew] = {}
-        self._live: ModuleContext | None = None
         build.shared(Homing).corrected = self.home
         for name, help_, read in (
             ("SET_SKEW", "Correct what was measured: XY=AC,BD,AD XZ= YZ=, or CLEAR=1", self._set),
-            ("GET_CURRENT_SKEW", "Report the skew that is corrected", self._tell),
+            ("GET_CURRENT_SKEW", "Report the skew that is corrected", self._report),
             ("CALC_MEASURED_SKEW", "Report the skew that the lengths AC BD AD mean", self._calculate),
             ("SKEW_PROFILE", "LOAD or SAVE a profile by its name", self._manage),
-            (RESTORE, "Let hold what held before a crash", self._restore),
+            (RESTORE, "Restore the skew that was corrected before a crash", self._restore),
         ):
-            build.add_command(GCodeCommand(name, help_, read))
+            build.add_command(name, help_, read)
 
     def link(self, modules: Modules) -> None:
         """Find the profiles."""
-        for name in modules.names(SkewCorrection):
-            found = modules.find(name, SkewCorrection)
-            assert found is not None
-            if found.profile:
-                self._profiles[found.profile] = found.skew
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
+        self._profiles = {found.profile: found.skew for found in modules.of(SkewCorrection) if found.profile}
 
     def status(self) -> Mapping[str, Value]:
         """Report the profile that was loaded last, and what holds."""
@@ -141,13 +130,13 @@ class Skews(Module):
         return {"current_profile_name": self._profile, **factors}
 
     def take(self, job: ProgramContext, skew: Skew, profile: str = "") -> bool:
-        """Let SKEW hold from here on; the head stays. False: the planner has to be emptied first."""
+        """Correct SKEW from here on; the head stays. False: the planner has to be emptied first."""
         if not come_to_standstill(job):
             return False
         planner = job.planner
-        believed = self.now.wanted(planner.toolhead_position)
+        driven = self.now.wanted(planner.toolhead_position)
         self.now, self._profile = skew, profile
-        position = skew.made(believed)
+        position = skew.made(driven)
         planner.set_position(position)
         at_s = planner.print_time_end_s
         job.emit(PositionSet(job.line, "", position, at_s))
@@ -157,7 +146,7 @@ class Skews(Module):
         return True
 
     def home(self, read: Callable[[Call, str], Reading]) -> Callable[[Call, str], Reading]:
-        """Return what reads G28 as READ does, whose endstops tell what steppers have to believe."""
+        """Return what reads G28 as READ does, and converts the positions of endstops to those of programs."""
 
         def homing(call: Call, axes: str) -> Reading:
             reading = read(call, axes)
@@ -175,18 +164,18 @@ class Skews(Module):
             if done is None or done.position is None:
                 return done
             before = self.now.wanted(call.position)
-            believed = [
+            driven = [
                 new if letter in done.homed else old
                 for letter, old, new in zip("XYZE", before, done.position, strict=True)
             ]
-            x, y, z, _ = self.now.made((believed[0], believed[1], believed[2], 0.0))
+            x, y, z, _ = self.now.made((driven[0], driven[1], driven[2], 0.0))
             return replace(done, position=(x, y, z, done.position[3]))
 
         return corrected
 
     @property
     def restoring(self) -> str:
-        """The line that brings about what holds; empty: nothing is corrected."""
+        """The line that restores the skew in effect; empty: nothing is corrected."""
         if self.now == Skew():
             return ""
         return " ".join((RESTORE, *(f"{plane}={getattr(self.now, plane.lower()):.12g}" for plane in _PLANES)))
@@ -194,14 +183,14 @@ class Skews(Module):
     # ------------------------------------------------------------------------------------------ commands
 
     def _restore(self, call: Call) -> Reading:
-        given = parameters(call.command, _PLANES)
+        given = call.parameters(*_PLANES)
         skew = Skew(**{plane.lower(): value(call.command, given, plane, 0.0) for plane in _PLANES})
-        return ToProgram(lambda job: self.take(job, skew))
+        return ProgramAction(lambda job: self.take(job, skew))
 
     def _set(self, call: Call) -> Reading:
-        given = parameters(call.command, (*_PLANES, "CLEAR"))
+        given = call.parameters(*_PLANES, "CLEAR")
         if flag(call.command, given, "CLEAR"):
-            return ToProgram(lambda job: self.take(job, Skew()))
+            return ProgramAction(lambda job: self.take(job, Skew()))
         measured = {
             plane: measured_skew(call.command, plane, text)
             for plane, text in given.items()
@@ -213,24 +202,24 @@ class Skews(Module):
         def act(job: ProgramContext) -> bool:
             return self.take(job, replace(self.now, **{plane.lower(): t for plane, t in measured.items()}))
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
-    def _tell(self, call: Call) -> Reading:
-        parameters(call.command, ())
-        return Immediate(tuple(f"{plane}: {_told(getattr(self.now, plane.lower()))}" for plane in _PLANES))
+    def _report(self, call: Call) -> Reading:
+        call.parameters()
+        return Immediate(tuple(f"{plane}: {_shown(getattr(self.now, plane.lower()))}" for plane in _PLANES))
 
     def _calculate(self, call: Call) -> Reading:
-        given = parameters(call.command, ("AC", "BD", "AD"))
+        given = call.parameters("AC", "BD", "AD")
         ac, bd, ad = (value(call.command, given, name) for name in ("AC", "BD", "AD"))
-        return Immediate((f"Calculated skew: {_told(skew_of(call.command, ac, bd, ad))}",))
+        return Immediate((f"Calculated skew: {_shown(skew_of(call.command, ac, bd, ad))}",))
 
     def _manage(self, call: Call) -> Reading:
-        given = parameters(call.command, ("LOAD", "SAVE"))
+        given = call.parameters("LOAD", "SAVE")
         if len(given) != 1:
             raise WordError("SKEW_PROFILE takes LOAD=name or SAVE=name; to remove one, remove its section")
         if "LOAD" in given:
             name = one(call.command, given, "LOAD", self._profiles)
-            return ToProgram(lambda job: self.take(job, self._profiles[name], name))
+            return ProgramAction(lambda job: self.take(job, self._profiles[name], name))
         name = given["SAVE"]
         if not name.isidentifier():
             raise WordError(
@@ -275,6 +264,6 @@ def skew_of(command: Command, ac: float, bd: float, ad: float) -> float:
     return tangent
 
 
-def _told(tangent: float) -> str:
+def _shown(tangent: float) -> str:
     angle = math.atan(tangent)
     return f"{angle:.6f} radians, {math.degrees(angle):.2f} degrees"

@@ -1,25 +1,25 @@
-"""[firmware_retraction]: G10 draws the filament back, G11 pushes it forward again."""
+"""[firmware_retraction]: G10 retracts the filament, G11 undoes that."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
+from coordinator.gcode.commands import Call, Immediate, Lines, Reading
+from coordinator.gcode.parameters import bounded
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import bounded, parameters
 from coordinator.support.values import Value
 
 LENGTH = FloatOption(
-    name="retract_length", help="How far G10 draws back", default=0.0, unit="mm", minimum=0.0, maximum=100.0
+    name="retract_length", help="How far G10 retracts", default=0.0, unit="mm", minimum=0.0, maximum=100.0
 )
 SPEED = FloatOption(
     name="retract_speed", help="How fast", default=20.0, unit="mm/s", minimum=1.0, maximum=1000.0
 )
 EXTRA = FloatOption(
     name="unretract_extra_length",
-    help="By how much more G11 pushes forward than G10 has drawn back",
+    help="How much more filament G11 pushes forward than G10 retracted",
     default=0.0,
     unit="mm",
     minimum=0.0,
@@ -30,7 +30,7 @@ BACK_SPEED = FloatOption(
 )
 HOP = FloatOption(
     name="z_hop_height",
-    help="How far the nozzle is lifted while the filament is drawn back",
+    help="How far the nozzle is lifted while the filament is retracted",
     default=0.0,
     unit="mm",
     minimum=0.0,
@@ -49,8 +49,9 @@ class _Settings:
 
 
 class FirmwareRetraction(Module):
-    """Its commands; how far the filament is drawn back is what G10 did, also when settings change."""
+    """The commands; G11 undoes what G10 did, also when settings changed meanwhile."""
 
+    KIND = "firmware_retraction"
     SPEC = SectionSpec(
         "Retraction by G10 and G11",
         (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP),
@@ -64,18 +65,22 @@ class FirmwareRetraction(Module):
             get(LENGTH), get(SPEED), get(EXTRA), get(BACK_SPEED), get(HOP)
         )
         self._retracted: _Settings | None = None
-        """What G10 went by."""
-        build.add_command(GCodeCommand("G10", "Draw the filament back", self._retract))
-        build.add_command(GCodeCommand("G11", "Push the filament forward again", self._unretract))
+        """The settings that G10 used; None: the filament is not retracted."""
+        build.add_command("G10", "Retract the filament", self._retract)
+        build.add_command("G11", "Undo the retraction", self._unretract)
         for name, help_, read in (
-            ("SET_RETRACTION", "Change how G10 and G11 act", self._set),
+            ("SET_RETRACTION", "Change the settings of G10 and G11", self._set),
             ("GET_RETRACTION", "Report the settings of G10 and G11", self._get),
-            ("CLEAR_RETRACTION", "Forget that the filament is drawn back, and all changes", self._clear),
+            (
+                "CLEAR_RETRACTION",
+                "Restore the configured settings, and forget that the filament is retracted",
+                self._clear,
+            ),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def status(self) -> Mapping[str, Value]:
-        """Report the settings, and whether the filament is drawn back."""
+        """Report the settings, and whether the filament is retracted."""
         return {**vars(self._settings), "retracted": self._retracted is not None}
 
     def _retract(self, _call: Call) -> Reading:
@@ -97,7 +102,7 @@ class FirmwareRetraction(Module):
 
     @staticmethod
     def _lines(lines: list[str]) -> Lines:
-        """Return LINES within the modes that they need, and without any trace in those of the program."""
+        """Return LINES in the modes that they need; the modes of the program stay as they are."""
         moves = [line for line in lines if line.startswith("G1")]
         others = [line for line in lines if not line.startswith("G1")]
         framed = [
@@ -113,7 +118,7 @@ class FirmwareRetraction(Module):
     def _set(self, call: Call) -> Reading:
         command = call.command
         options = {option.name.upper(): option for option in (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP)}
-        values = parameters(command, options)
+        values = call.parameters(*options)
         if not values:
             raise WordError(f"SET_RETRACTION names nothing; it takes {' '.join(options)}")
         changes = {}
@@ -129,8 +134,8 @@ class FirmwareRetraction(Module):
         return Immediate(act=act)
 
     def _get(self, _call: Call) -> Reading:
-        told = [f"{name.upper()}={value:g}" for name, value in vars(self._settings).items()]
-        return Immediate((" ".join(told),))
+        texts = [f"{name.upper()}={value:g}" for name, value in vars(self._settings).items()]
+        return Immediate((" ".join(texts),))
 
     def _clear(self, _call: Call) -> Reading:
         def act() -> None:

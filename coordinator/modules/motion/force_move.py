@@ -1,6 +1,6 @@
-"""[force_move]: moving one motor without homing, and saying where the head is. For trying out and for macros.
+"""[force_move]: moves one motor without homing, and sets the position of the head. For tests and macros.
 
-Nothing keeps these moves within the machine, so the section has to allow them. A motor of the head that was
+No limit applies to these moves, so the section has to enable them. A motor of the head that was
 moved alone leaves all axes unknown.
 """
 
@@ -8,16 +8,16 @@ import math
 from typing import Final
 
 from coordinator.config.options import BoolOption, SectionSpec
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
+from coordinator.gcode.parameters import bounded, needed, one
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.single import Ramp, SingleMove
 
 ENABLE: Final = BoolOption(
     name="enable_force_move",
-    help="whether there are FORCE_MOVE and SET_KINEMATIC_POSITION, which no limit of the machine applies to",
+    help="enables FORCE_MOVE and SET_KINEMATIC_POSITION, which ignore the limits of the machine",
     default=False,
 )
 DISTANCE_MAX_MM: Final = 1000.0
@@ -29,45 +29,36 @@ _AXES: Final = "XYZ"
 class ForceMove(Module):
     """The commands."""
 
+    KIND = "force_move"
     SPEC = SectionSpec("Commands that move past all limits", (ENABLE,))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._machine = build.machine
-        self._live: ModuleContext | None = None
         if not build.get(ENABLE):
             return
         build.add_command(
-            GCodeCommand(
-                "FORCE_MOVE",
-                "Move the motor STEPPER by DISTANCE mm at VELOCITY mm/s, with ACCEL mm/s² if given",
-                self._read_move,
-            )
+            "FORCE_MOVE",
+            "Move the motor STEPPER by DISTANCE mm at VELOCITY mm/s, with ACCEL mm/s² if given",
+            self._read_move,
         )
         build.add_command(
-            GCodeCommand(
-                "SET_KINEMATIC_POSITION",
-                "Say where the head is: X Y Z in mm; SET_HOMED and CLEAR_HOMED name axes",
-                self._read_position,
-            )
+            "SET_KINEMATIC_POSITION",
+            "Set the position of the head: X Y Z in mm; SET_HOMED and CLEAR_HOMED name axes",
+            self._read_position,
         )
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
 
     # ----------------------------------------------------------------------------------------------- moving
 
     def _read_move(self, call: Call) -> Reading:
         values = call.parameters("STEPPER", "DISTANCE", "VELOCITY", "ACCEL")
-        name = values.get("STEPPER", "")
-        names = [stepper.name for stepper in self._machine.steppers]
-        if name not in names:
-            raise WordError(f"FORCE_MOVE names the motor {quoted(name)}; there are {' '.join(names)}")
-        distance = _number(call, values, "DISTANCE", -DISTANCE_MAX_MM, DISTANCE_MAX_MM)
-        speed = _number(call, values, "VELOCITY", 1e-3, SPEED_MAX)
+        name = one(call.command, values, "STEPPER", (s.name for s in self._machine.steppers))
+        for key in ("DISTANCE", "VELOCITY"):
+            needed(call.command, values, key)
+        distance = bounded(call.command, values, "DISTANCE", 0.0, low=-DISTANCE_MAX_MM, high=DISTANCE_MAX_MM)
+        speed = bounded(call.command, values, "VELOCITY", 0.0, low=1e-3, high=SPEED_MAX)
         limits = self._machine.limits
-        accel = _number(call, values, "ACCEL", 0.0, ACCEL_MAX) if "ACCEL" in values else 0.0
+        accel = bounded(call.command, values, "ACCEL", 0.0, low=0.0, high=ACCEL_MAX)
         of_head = name in [motor.name for motor in self._machine.motors]
         done = Done(position=call.position, unhomed=_AXES if of_head else "", moved=True)
 
@@ -78,11 +69,10 @@ class ForceMove(Module):
         return AtStandstill(move, done)
 
     async def _move(self, name: str, distance_mm: float, speed: float, accel: float) -> None:
-        assert self._live is not None
         if distance_mm:
             ramp = Ramp(abs(distance_mm), speed, accel)
             ways = {name: math.copysign(1.0, distance_mm)}
-            await SingleMove(self._live.machine, ramp, ways=ways).run()
+            await SingleMove(self.live.machine, ramp, ways=ways).run()
 
     # -------------------------------------------------------------------------------------------- positions
 
@@ -91,7 +81,7 @@ class ForceMove(Module):
         values = call.parameters(*_AXES, "SET_HOMED", "CLEAR_HOMED")
         limit = 100_000.0
         x, y, z = (
-            _number(call, values, axis, -limit, limit) if axis in values else at
+            bounded(call.command, values, axis, at, low=-limit, high=limit)
             for axis, at in zip(_AXES, call.position[:3], strict=True)
         )
         known = _letters(call, values, "SET_HOMED", _AXES)
@@ -103,21 +93,6 @@ class ForceMove(Module):
             return done
 
         return AtStandstill(take, done)
-
-
-def _number(call: Call, values: dict[str, str], key: str, low: float, high: float) -> float:
-    try:
-        value = float(values[key])
-    except KeyError:
-        raise WordError(f"{call.command.name} lacks {key}=…") from None
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise WordError(
-            f"{key} of {call.command.name} is {quoted(values[key])}; it must be a number from {low:g} to"
-            f" {high:g}"
-        )
-    return value
 
 
 def _letters(call: Call, values: dict[str, str], key: str, default: str) -> str:

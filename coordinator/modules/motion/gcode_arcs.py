@@ -1,4 +1,4 @@
-"""[gcode_arcs]: how finely G2 and G3 are made of straight moves; they work without it, too."""
+"""[gcode_arcs]: how finely G2 and G3 are divided into straight moves; they work without it, too."""
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.modules.base import Build, Module
@@ -6,7 +6,7 @@ from coordinator.motion.planner.language import ARC_DEVIATION_MM, ARC_PIECE_MM
 
 RESOLUTION = FloatOption(
     name="resolution",
-    help="No piece of an arc is longer",
+    help="Largest length of a piece of an arc",
     default=ARC_PIECE_MM,
     unit="mm",
     minimum=0.01,
@@ -14,7 +14,7 @@ RESOLUTION = FloatOption(
 )
 DEVIATION = FloatOption(
     name="max_deviation",
-    help="No piece of an arc is further away from it",
+    help="Largest distance of a piece from the arc",
     default=ARC_DEVIATION_MM,
     unit="mm",
     minimum=0.0001,
@@ -23,8 +23,9 @@ DEVIATION = FloatOption(
 
 
 class GCodeArcs(Module):
-    """Only numbers, for the planner."""
+    """The precision, for the planner."""
 
+    KIND = "gcode_arcs"
     SPEC = SectionSpec("The precision of arcs (G2, G3)", (RESOLUTION, DEVIATION))
 
     def __init__(self, build: Build) -> None:

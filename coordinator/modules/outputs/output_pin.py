@@ -5,11 +5,11 @@ from typing import ClassVar, Final
 
 from coordinator.config.options import BoolOption, FloatOption, ListOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
+from coordinator.gcode.commands import Call, Reading, Synchronized
+from coordinator.gcode.parameters import one, value
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
-from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
-from coordinator.modules.words import one, parameters, value
+from coordinator.modules.outputs.timing import AHEAD_S, pwm_cycle
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
@@ -19,16 +19,16 @@ from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
 PIN: Final = PinOption(name="pin", help="the output")
-PWM: Final = BoolOption(name="pwm", help="whether it may be anything from off to on, by PWM", default=False)
-VALUE: Final = FloatOption(name="value", help="what it has from the start on", default=0.0)
+PWM: Final = BoolOption(name="pwm", help="whether it takes values between off and on, by PWM", default=False)
+VALUE: Final = FloatOption(name="value", help="value at the start", default=0.0)
 SHUTDOWN_VALUE: Final = FloatOption(
     name="shutdown_value",
-    help="what it has when its node stops for safety; without hardware_pwm off or on",
+    help="value when its node stops for safety; without hardware_pwm off or on",
     default=0.0,
 )
 SCALE: Final = FloatOption(
     name="scale",
-    help="what 'on' is called: values of this section and of SET_PIN are 0 to scale",
+    help="value of 'on': values of this section and of SET_PIN are 0 to scale",
     default=1.0,
     above=0,
     maximum=1_000_000,
@@ -52,22 +52,18 @@ PINS: Final = ListOption(
 class OutputPins(Module):
     """The outputs that programs set."""
 
-    SPEC: ClassVar = SectionSpec(help="What outputs have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.by_name: dict[str, OutputPin] = {}
         build.add_command(
-            GCodeCommand(
-                "SET_PIN",
-                "Set an output_pin at its place among the moves: PIN= VALUE=",
-                self._set,
-                while_printing=True,
-            )
+            "SET_PIN",
+            "Set an output_pin, synchronized with the moves: PIN= VALUE=",
+            self._set,
+            while_printing=True,
         )
 
     def _set(self, call: Call) -> Reading:
-        given = parameters(call.command, ("PIN", "VALUE"))
+        given = call.parameters("PIN", "VALUE")
         pin = self.by_name[one(call.command, given, "PIN", self.by_name)]
         wanted = value(call.command, given, "VALUE")
         if not pin.allows(wanted):
@@ -78,6 +74,7 @@ class OutputPins(Module):
 class OutputPin(Module):
     """An output that programs set."""
 
+    KIND = "output_pin"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="An output that programs set: SET_PIN PIN=NAME VALUE=",
@@ -114,9 +111,8 @@ class OutputPin(Module):
             self._output = DigitalOut(
                 what, pin=pin.name, invert=pin.invert, start=begin > 0, shutdown=stopped > 0
             )
-        add_pinned(build, self._output, pin)
+        build.add_device(pin.node, self._output, pin)
         build.add_device(pin.node, self)
-        self._live: ModuleContext | None = None
         build.shared(OutputPins).by_name[build.instance] = self
 
     def _share(self, build: Build, option: FloatOption) -> float:
@@ -139,20 +135,20 @@ class OutputPin(Module):
         """Do nothing: its output is a device of its own."""
 
     def started(self, node: "Node") -> None:
-        """Take note that its node has started, with the output as it was configured."""
+        """Record that the output has its start value: its node has started."""
         del node
         self._now = self._begin
         if self._live is not None and self._begins_late:
             self.set(self._begin * self._scale)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
-        self._live = live
+        """Start acting."""
+        await super().connect(live)
         if self._begins_late:
             self.set(self._begin * self._scale)
 
     def set(self, wanted: float, print_time_s: float = 0.0) -> None:
-        """Have a value from a print time on, soon by default. Without effect while not connected."""
+        """Set a value from a print time on, soon by default. No effect while not connected."""
         live = self._live
         if live is None:
             return
@@ -165,33 +161,30 @@ class OutputPin(Module):
             else:
                 self._output.set(node, clock, share > 0)
         except CanductorError as error:
-            live.say(f"[{self.name}] cannot be set: {error}")
+            live.say(f"[{self.name}] was not set: {error}")
             return
         self._now = share
 
-    def stopped(self, cause: str) -> None:
-        """Act no more: its node has it at its shutdown_value."""
+    def end(self, cause: str) -> None:
+        """Stop acting: the node has set the output to its shutdown_value."""
         del cause
         self._live = None
 
-    def close(self) -> None:
-        """Act no more."""
-        self._live = None
-
     def status(self) -> Mapping[str, Value]:
-        """Tell its value."""
+        """Report its value."""
         return {"value": round(self._now * self._scale, 6)}
 
 
 class StaticDigitalOutput(Module):
-    """Outputs that have one value for ever."""
+    """Outputs that have one value."""
 
+    KIND = "static_digital_output"
     NAMED: ClassVar = True
-    SPEC: ClassVar = SectionSpec(help="Outputs that are switched at the start, and stay so", options=(PINS,))
+    SPEC: ClassVar = SectionSpec(help="Outputs that are switched once, at the start", options=(PINS,))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         for pin in build.pins(PINS):
             on = not pin.invert
             output = DigitalOut(f"[{build.name}]", pin=pin.name, start=on, shutdown=on)
-            add_pinned(build, output, pin)
+            build.add_device(pin.node, output, pin)

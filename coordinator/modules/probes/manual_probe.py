@@ -7,13 +7,11 @@ from bisect import insort
 from collections.abc import Callable
 from typing import Final
 
-from coordinator.config.options import SectionSpec
 from coordinator.gcode.builtins.state import go
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, ProgramContext, Reading, ToProgram
+from coordinator.gcode.commands import AtStandstill, Call, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.events import Done, Reply
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 SPEED: Final = 5.0
@@ -27,13 +25,10 @@ _BEGUN: Final = "now move with TESTZ Z=-0.1 (+, -, ++, --) until it fits; end wi
 class ManualProbe(Module):
     """The commands; one search at a time."""
 
-    SPEC = SectionSpec(help="Heights by hand", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "manual_probe"
         self._machine = build.machine
-        self._live: ModuleContext | None = None
         self._accepted: Callable[[float], tuple[str, ...]] | None = None
         """What a height that is accepted leads to; None: nothing is looked for."""
         self._speed = SPEED
@@ -54,11 +49,7 @@ class ManualProbe(Module):
                 self._read_apply,
             ),
         ):
-            build.add_command(GCodeCommand(name, text, read))
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
+            build.add_command(name, text, read)
 
     def status(self) -> dict[str, Value]:
         """Return whether a height is looked for."""
@@ -111,7 +102,7 @@ class ManualProbe(Module):
             self._tell(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     # ------------------------------------------------------------------------------------------------ search
 
@@ -131,7 +122,7 @@ class ManualProbe(Module):
             self._tell(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _target(self, command: Command, word: str, z: float) -> float:
         below, above = self._beside(z)
@@ -189,6 +180,5 @@ class ManualProbe(Module):
         return self._accepted
 
     def _keep(self, endstop: float) -> tuple[str, ...]:
-        assert self._live is not None
-        self._live.save("stepper_z", "position_endstop", f"{endstop:.3f}")
+        self.live.save("stepper_z", "position_endstop", f"{endstop:.3f}")
         return (f"stepper_z: position_endstop: {endstop:.3f}; SAVE_CONFIG writes it and restarts",)

@@ -1,22 +1,20 @@
-"""[delayed_gcode NAME]: g-code that is run after a while, by itself; and again, if it says so."""
+"""[delayed_gcode NAME]: g-code that runs after a delay, and again when it asks for that."""
 
 from collections.abc import Callable, Mapping
 from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
-from coordinator.gcode.parser import Command, WordError, quoted
+from coordinator.gcode.commands import Call, Immediate, Reading
+from coordinator.gcode.parameters import bounded, needed, one
+from coordinator.gcode.parser import Command
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
-from coordinator.modules.words import bounded, needed, parameters
-from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest
 from coordinator.support.values import Value
 
-GCODE = GCodeOption(name="gcode", help="What is done: g-code, with Jinja2 between { and {% %}")
+GCODE = GCodeOption(name="gcode", help="What is run: g-code, with Jinja2 between { and {% %}")
 INITIAL = FloatOption(
     name="initial_duration",
-    help="How long after the start it runs; 0: only when UPDATE_DELAYED_GCODE says so",
+    help="Delay after the start; 0: only UPDATE_DELAYED_GCODE starts it",
     default=0.0,
     unit="s",
     minimum=0.0,
@@ -24,15 +22,16 @@ INITIAL = FloatOption(
 )
 DURATION_MAX_S: Final = 1e6
 SHORTEST_S: Final = 0.05
-"""However short a duration, others get their turn between two runs."""
+"""The shortest delay between two runs: others must get their turn."""
 _COMMAND: Final = "_RUN_DELAYED_GCODE"
 
 
 class DelayedGCode(Module):
-    """One of them; a service runs its lines as those of a client."""
+    """One section; a service runs its lines as those of a client."""
 
+    KIND = "delayed_gcode"
     SPEC = SectionSpec(
-        "G-code that runs by itself after a while", (GCODE, INITIAL), unsupported=("description",)
+        "G-code that runs by itself after a delay", (GCODE, INITIAL), unsupported=("description",)
     )
     NAMED = True
 
@@ -41,33 +40,24 @@ class DelayedGCode(Module):
         self.id = build.instance
         self.template = GCodeTemplate(build, GCODE)
         self._initial_s = build.get(INITIAL)
-        self._live: ModuleContext | None = None
         self._call_off: Callable[[], None] | None = None
         build.shared(DelayedGCodes)
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take the clock."""
-        self._live = live
-
     def ready(self) -> None:
-        """Begin to wait."""
+        """Start the initial delay."""
         self.wait(self._initial_s)
 
-    def stopped(self, cause: str) -> None:  # noqa: ARG002
-        """Run no more."""
-        self.close()
-
-    def close(self) -> None:
-        """Run no more."""
+    def end(self, cause: str) -> None:  # noqa: ARG002
+        """Stop running."""
         self.wait(0)
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
-        """Return whether it is going to run."""
+        """Report whether it is going to run."""
         return {"waits": self._call_off is not None}
 
     def wait(self, duration_s: float) -> None:
-        """Run after DURATION_S; 0: not at all. On the control loop."""
+        """Run after DURATION_S; 0: cancel. On the control loop."""
         if self._call_off is not None:
             self._call_off()
             self._call_off = None
@@ -75,7 +65,7 @@ class DelayedGCode(Module):
             self._call_off = self._live.after(max(duration_s, SHORTEST_S), self._run)
 
     def wait_from_program(self, duration_s: float) -> None:
-        """Do the same, from the reader's thread; without a machine nothing."""
+        """Do the same from the reader's thread; no effect without a machine."""
         if (live := self._live) is not None:
             live.soon_on_loop(lambda: self.wait(duration_s))
 
@@ -91,44 +81,29 @@ class DelayedGCode(Module):
 
 
 class DelayedGCodes(Module):
-    """The commands of all."""
-
-    SPEC = SectionSpec("Commands about delayed g-code", ())
+    """The commands for all delayed g-codes."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._all: dict[str, DelayedGCode] = {}
         build.add_command(
-            GCodeCommand(
-                "UPDATE_DELAYED_GCODE", "Have the delayed g-code ID run after DURATION; 0: not at all",
-                self._update, while_printing=True,
-            )
-        )  # fmt: skip
-        build.add_command(
-            GCodeCommand(_COMMAND, "What a delayed g-code does", self._run, while_printing=True)
-        )
+                "UPDATE_DELAYED_GCODE", "Run the delayed g-code ID after DURATION s; 0: cancel it",
+                self._update, while_printing=True)  # fmt: skip
+        build.add_command(_COMMAND, "Run a delayed g-code", self._run, while_printing=True)
 
     def link(self, modules: Modules) -> None:
-        """Find them."""
-        for name in modules.names(DelayedGCode):
-            found = modules.find(name, DelayedGCode)
-            assert found is not None
-            self._all[found.id] = found
+        """Find all sections."""
+        self._all = {found.id: found for found in modules.of(DelayedGCode)}
 
     def _named(self, command: Command, values: Mapping[str, str]) -> DelayedGCode:
-        name = needed(command, values, "ID")
-        found = self._all.get(name)
-        if found is None:
-            hint = nearest(name, self._all) or f"; there is {', '.join(self._all)}"
-            raise WordError(f"{command.name} names the delayed g-code {quoted(name)}, of which none{hint}")
-        return found
+        return self._all[one(command, values, "ID", self._all)]
 
     def _update(self, call: Call) -> Reading:
-        values = parameters(call.command, ("ID", "DURATION"))
+        values = call.parameters("ID", "DURATION")
         found = self._named(call.command, values)
         needed(call.command, values, "DURATION")
         duration_s = bounded(call.command, values, "DURATION", 0.0, low=0.0, high=DURATION_MAX_S)
         return Immediate(act=lambda: found.wait_from_program(duration_s))
 
     def _run(self, call: Call) -> Reading:
-        return self._named(call.command, parameters(call.command, ("ID",))).template.lines(call, {})
+        return self._named(call.command, call.parameters("ID")).template.lines(call, {})

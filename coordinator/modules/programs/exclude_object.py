@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, ProgramContext, Reading, ToProgram
+from coordinator.gcode.commands import Call, Immediate, ProgramAction, ProgramContext, Reading
+from coordinator.gcode.parameters import flag, needed
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import flag, needed, parameters
 from coordinator.motion.planner.planner import FeedStatus, Planner
-from coordinator.support.quoting import nearest
+from coordinator.support.quoting import nearest_or_all
 from coordinator.support.values import Value
 
 OBJECTS_MAX: Final = 1000
@@ -34,7 +34,8 @@ class _Object:
 class ExcludeObject(Module):
     """The objects of the program that is being read."""
 
-    SPEC = SectionSpec("Leaving out single objects of a print", (), unsupported=("enable_exclude_object",))
+    KIND = "exclude_object"
+    SPEC = SectionSpec("Stop printing single objects of a job", (), unsupported=("enable_exclude_object",))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -47,16 +48,16 @@ class ExcludeObject(Module):
         """Whether no moves are left out, whatever is excluded: a program is read again up to where it was."""
         for name, help_, read, while_printing in (
             ("EXCLUDE_OBJECT_DEFINE", "Define an object: NAME, CENTER, POLYGON", self._define, False),
-            ("EXCLUDE_OBJECT_START", "An object begins", self._start, False),
-            ("EXCLUDE_OBJECT_END", "An object ends", self._end, False),
-            ("EXCLUDE_OBJECT", "Leave out an object from here on", self._exclude, True),
+            ("EXCLUDE_OBJECT_START", "Mark the begin of an object", self._start, False),
+            ("EXCLUDE_OBJECT_END", "Mark the end of an object", self._end, False),
+            ("EXCLUDE_OBJECT", "Stop printing an object", self._exclude, True),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=while_printing))
+            build.add_command(name, help_, read, while_printing=while_printing)
 
     def status(self) -> Mapping[str, Value]:
         """Report the objects, which of them are left out, and which one is being read."""
         return {
-            "objects": [_told(found) for found in tuple(self._objects.values())],
+            "objects": [_status(found) for found in tuple(self._objects.values())],
             "excluded_objects": [*sorted(self._excluded)],
             "current_object": self._current,
         }
@@ -77,7 +78,7 @@ class ExcludeObject(Module):
         self._current = other._current  # noqa: SLF001
 
     def begin_leaving_out(self, planner: "Planner") -> None:
-        """Take note that PLANNER leaves out moves: the program was in an excluded object before."""
+        """Record that PLANNER leaves out moves: the program was in an excluded object before."""
         self._retracted_mm = planner.retracted_mm
 
     def forget(self) -> None:
@@ -86,12 +87,12 @@ class ExcludeObject(Module):
         self._excluded.clear()
         self._current = self._retracted_mm = None
 
-    # ---- What a program tells ----
+    # ---- Commands of the program ----
 
     def _define(self, call: Call) -> Reading:
-        values = parameters(call.command, ("NAME", "CENTER", "POLYGON", "RESET", "JSON"))
+        values = call.parameters("NAME", "CENTER", "POLYGON", "RESET", "JSON")
         if flag(call.command, values, "RESET"):
-            return ToProgram(self._reset)
+            return ProgramAction(self._reset)
         if "NAME" not in values:
             return Immediate((f"Known objects: {' '.join(self._objects) or 'none'}",))
         found = _Object(
@@ -113,7 +114,7 @@ class ExcludeObject(Module):
         return done
 
     def _start(self, call: Call) -> Reading:
-        name = needed(call.command, parameters(call.command, ("NAME",)), "NAME").upper()
+        name = needed(call.command, call.parameters("NAME"), "NAME").upper()
 
         def act(job: ProgramContext) -> bool:
             if name not in self._objects:
@@ -124,10 +125,10 @@ class ExcludeObject(Module):
             self._look(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _end(self, call: Call) -> Reading:
-        parameters(call.command, ("NAME",))
+        call.parameters("NAME")
 
         def act(job: ProgramContext) -> bool:
             done = self._make_moves(job)
@@ -135,16 +136,16 @@ class ExcludeObject(Module):
                 self._current = None
             return done
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
-    # ---- What the user wants ----
+    # ---- Commands of the user ----
 
     def _exclude(self, call: Call) -> Reading:
         command = call.command
-        values = parameters(command, ("NAME", "CURRENT", "RESET"))
+        values = call.parameters("NAME", "CURRENT", "RESET")
         name = values.get("NAME", "").upper()
         if flag(command, values, "RESET"):
-            return ToProgram(lambda job: self._take_back(job, name))
+            return ProgramAction(lambda job: self._take_back(job, name))
         if flag(command, values, "CURRENT"):
             name = self._current or ""
             if not name:
@@ -152,7 +153,7 @@ class ExcludeObject(Module):
         if not name:
             return Immediate((f"Excluded objects: {' '.join(sorted(self._excluded)) or 'none'}",))
         if name not in self._objects:
-            hint = nearest(name, self._objects) or f"; there is {', '.join(self._objects) or 'none'}"
+            hint = nearest_or_all(name, self._objects)
             raise WordError(f"EXCLUDE_OBJECT names {quoted(name)}, which is no object of this program{hint}")
 
         def act(job: ProgramContext) -> bool:
@@ -160,7 +161,7 @@ class ExcludeObject(Module):
             self._look(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _take_back(self, job: ProgramContext, name: str) -> bool:
         if (not name or name == self._current) and not self._make_moves(job):
@@ -171,7 +172,7 @@ class ExcludeObject(Module):
             self._excluded.clear()
         return True
 
-    # ---- What becomes of the moves ----
+    # ---- Excluding moves ----
 
     def _look(self, job: ProgramContext) -> None:
         """Leave out moves from here on, if this is an object to be left out."""
@@ -195,13 +196,13 @@ class ExcludeObject(Module):
         return True
 
 
-def _told(found: _Object) -> Value:
-    told: dict[str, Value] = {"name": found.name}
+def _status(found: _Object) -> Value:
+    status: dict[str, Value] = {"name": found.name}
     if found.center is not None:
-        told["center"] = list(found.center)
+        status["center"] = list(found.center)
     if found.polygon:
-        told["polygon"] = [list(point) for point in found.polygon]
-    return told
+        status["polygon"] = [list(point) for point in found.polygon]
+    return status
 
 
 def _point(command: Command, words: "list[str]") -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""[gcode_macro NAME]: a command that stands for lines of g-code, made by a template when it is called."""
+"""[gcode_macro NAME]: a command that is replaced by lines of g-code, which a template renders."""
 
 import ast
 import re
@@ -8,14 +8,14 @@ from typing import Any, Final
 from coordinator.config.errors import ConfigError, Place
 from coordinator.config.options import GCodeOption, Option, SectionSpec, TextOption
 from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
+from coordinator.gcode.parameters import needed, one
 from coordinator.gcode.parser import Command, WordError, parse, quoted
 from coordinator.gcode.templates.templates import Asked, Template, TemplateError, line_of
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.printer_status import PrinterStatus
-from coordinator.support.quoting import nearest
 from coordinator.support.values import Value
 
-GCODE = GCodeOption(name="gcode", help="What is done: g-code, with Jinja2 between { } and {% %}")
+GCODE = GCodeOption(name="gcode", help="What is run: g-code, with Jinja2 between { } and {% %}")
 RENAME = TextOption(
     name="rename_existing",
     help="Name for the command that had this macro's name before, such as M109.1 or BASE_PAUSE",
@@ -100,8 +100,9 @@ class GCodeTemplate:
 class GCodeMacro(Module):
     """One macro."""
 
+    KIND = "gcode_macro"
     SPEC = SectionSpec(
-        "A command of its own: NAME, in capitals, stands for lines of g-code",
+        "A macro: the command NAME, in capitals, runs these lines of g-code",
         (GCODE, RENAME, DESCRIPTION),
         family=VARIABLE,
     )
@@ -133,7 +134,7 @@ class GCodeMacro(Module):
 
     @property
     def text(self) -> str:
-        """What it stands for, as it is written."""
+        """Its template, as it is written."""
         return self._template.text
 
     def _read(self, call: Call) -> Reading:
@@ -142,37 +143,27 @@ class GCodeMacro(Module):
 
 
 class Variables(Module):
-    """What all macros have in common."""
-
-    SPEC = SectionSpec("Commands about macros", ())
+    """SET_GCODE_VARIABLE, for all macros."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._macros: dict[str, GCodeMacro] = {}
         build.add_command(
-            GCodeCommand(
-                "SET_GCODE_VARIABLE", "Give a macro's variable another value", self._set, while_printing=True
-            )
+            "SET_GCODE_VARIABLE",
+            "Set a variable of a macro: MACRO, VARIABLE, VALUE",
+            self._set,
+            while_printing=True,
         )
 
     def link(self, modules: Modules) -> None:
         """Find the macros."""
-        for name in modules.names(GCodeMacro):
-            macro = modules.find(name, GCodeMacro)
-            assert macro is not None
-            self._macros[macro.command] = macro
+        self._macros = {macro.command: macro for macro in modules.of(GCodeMacro)}
 
     def _set(self, call: Call) -> Reading:
         words = call.command.parameters()
         for key in ("MACRO", "VARIABLE", "VALUE"):
-            if key not in words:
-                raise WordError(f"SET_GCODE_VARIABLE has no {key}; add {key}=...")
-        macro = self._macros.get(words["MACRO"].upper())
-        if macro is None:
-            hint = nearest(words["MACRO"], self._macros)
-            raise WordError(
-                f"SET_GCODE_VARIABLE names the macro {quoted(words['MACRO'])}, of which none{hint}"
-            )
+            needed(call.command, words, key)
+        macro = self._macros[one(call.command, words, "MACRO", self._macros)]
         name = words["VARIABLE"].lower()
         if name not in macro.variables:
             has = ", ".join(macro.variables) or "none"

@@ -1,4 +1,4 @@
-"""[idle_timeout]: what is done when nothing was done for a while; by default heaters and motors go off.
+"""[idle_timeout]: acts when the machine was idle for a while; by default heaters and motors are switched off.
 
 Every machine has it, with its defaults where there is no such section.
 """
@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
+from coordinator.gcode.commands import Call, Immediate, Lines, Reading
+from coordinator.gcode.parameters import bounded
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
-from coordinator.modules.words import bounded, parameters
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 TIMEOUT = FloatOption(
     name="timeout",
-    help="How long nothing may happen; a job that is paused counts as nothing",
+    help="How long the machine may be idle; while a job is paused it counts as idle",
     default=600.0,
     unit="s",
     above=0.0,
@@ -24,7 +24,7 @@ TIMEOUT = FloatOption(
 )
 GCODE = GCodeOption(
     name="gcode",
-    help="What is done then; without it, TURN_OFF_HEATERS and M84, as far as there are heaters and motors",
+    help="What is run then; by default TURN_OFF_HEATERS and M84, where there are heaters and motors",
     default="",
 )
 OFF: Final = ("TURN_OFF_HEATERS", "M84")
@@ -32,47 +32,43 @@ LOOK_S: Final = 1.0
 
 
 class IdleTimeout(Module):
-    """Watches, and acts."""
+    """Watches for idleness and acts."""
 
-    SPEC = SectionSpec("What is done when the machine is left alone", (TIMEOUT, GCODE))
+    KIND = "idle_timeout"
+    SPEC = SectionSpec("What is run when the machine is idle", (TIMEOUT, GCODE))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._configured_s = self._timeout_s = build.get(TIMEOUT)
         self._template = GCodeTemplate(build, GCODE) if build.find(GCODE) is not None else None
         self._default: tuple[str, ...] = ()
-        self._live: ModuleContext | None = None
         self._state = "Idle"
         self._since_s = 0.0
         self._busy_since_s: float | None = None
         self._works = 0
         self._acting = False
         build.add_command(
-            GCodeCommand("SET_IDLE_TIMEOUT", "Let nothing happen for TIMEOUT", self._set, while_printing=True)
+            "SET_IDLE_TIMEOUT", "Set the idle time-out: TIMEOUT, s", self._set, while_printing=True
         )
-        build.add_command(GCodeCommand("_IDLE_TIMEOUT", "What is done when nothing happens", self._lines))
+        build.add_command("_IDLE_TIMEOUT", "Run what [idle_timeout] does", self._lines)
 
     def link(self, modules: Modules) -> None:
-        """Find what there is to switch off."""
+        """Find out what can be switched off."""
         self._default = tuple(name for name in OFF if modules.knows(name))
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to watch."""
-        self._live = live
+        """Start watching."""
+        await super().connect(live)
         self._since_s = live.now_s()
         self._state = "Ready"
         live.every(LOOK_S, self.look)
 
-    def close(self) -> None:
-        """Watch no more."""
-        self._live = None
-
-    def stopped(self, cause: str) -> None:  # noqa: ARG002
-        """Watch no more: all is off."""
+    def end(self, cause: str) -> None:  # noqa: ARG002
+        """Stop watching: all is off."""
         self._live, self._state = None, "Idle"
 
     def status(self) -> Mapping[str, Value]:
-        """Tell Printing, Ready or Idle, and for how long it has been printing, s."""
+        """Report Printing, Ready or Idle, and for how long it has been printing, s."""
         printing_s = 0.0
         if self._live is not None and self._busy_since_s is not None:
             printing_s = self._live.now_s() - self._busy_since_s
@@ -83,12 +79,12 @@ class IdleTimeout(Module):
         }
 
     def look(self) -> None:
-        """See whether anything happens; on the control loop."""
+        """Check whether the machine is idle; on the control loop."""
         live = self._live
         if live is None or (runner := live.machine.runner) is None:
             return
         now_s = live.now_s()
-        if self._acting:  # what it does itself is no sign of life
+        if self._acting:  # its own lines do not count as activity
             self._acting, self._works = runner.busy, runner.works
             return
         works, self._works = self._works, runner.works
@@ -104,11 +100,11 @@ class IdleTimeout(Module):
             self._state = "Idle"
             if self._template is None and not self._default:
                 return
-            live.say(f"nothing happened for {self._timeout_s:g} s: {self._told()}")
+            live.say(f"the machine was idle for {self._timeout_s:g} s: {self._action()}")
             runner.run_lines("idle_timeout", ["_IDLE_TIMEOUT"])
             self._acting = True
 
-    def _told(self) -> str:
+    def _action(self) -> str:
         return (
             "the g-code of [idle_timeout] runs" if self._template is not None else " and ".join(self._default)
         )
@@ -119,7 +115,7 @@ class IdleTimeout(Module):
         return Lines("\n".join(self._default))
 
     def _set(self, call: Call) -> Reading:
-        values = parameters(call.command, ("TIMEOUT",))
+        values = call.parameters("TIMEOUT")
         timeout_s = bounded(call.command, values, "TIMEOUT", self._configured_s, low=0.001, high=1e6)
 
         def act() -> None:

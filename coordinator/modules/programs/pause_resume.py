@@ -1,4 +1,4 @@
-"""[pause_resume]: PAUSE, RESUME, CANCEL_PRINT and CLEAR_PAUSE, from the job itself or beside it.
+"""[pause_resume]: PAUSE, RESUME, CANCEL_PRINT and CLEAR_PAUSE, from the job itself or from a client.
 
 PAUSE remembers where the job stands; what its macro does afterwards (parking, drawing filament back) comes
 behind that. RESUME goes back there and lets the job go on.
@@ -9,16 +9,16 @@ from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.builtins.state import save_state
-from coordinator.gcode.commands import Call, GCodeCommand, ProgramContext, Reading, ToProgram
+from coordinator.gcode.commands import Call, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.events import Reply
+from coordinator.gcode.parameters import bounded
 from coordinator.modules.base import Build, Module
 from coordinator.modules.status.print_stats import PrintStats
-from coordinator.modules.words import bounded, parameters
 from coordinator.support.values import Value
 
 VELOCITY = FloatOption(
     name="recover_velocity",
-    help="How fast RESUME goes back, unless its VELOCITY says otherwise",
+    help="Speed at which RESUME moves back, unless it has a VELOCITY",
     default=50.0,
     unit="mm/s",
     above=0.0,
@@ -31,7 +31,8 @@ STATE: Final = "PAUSE_STATE"
 class PauseResume(Module):
     """The commands."""
 
-    SPEC = SectionSpec("Pausing a job, by g-code", (VELOCITY,))
+    KIND = "pause_resume"
+    SPEC = SectionSpec("Pause and resume a job by g-code", (VELOCITY,))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -41,14 +42,14 @@ class PauseResume(Module):
         build.shared(PrintStats)
         for name, help_, read in (
             ("PAUSE", "Pause the job", self._pause),
-            ("RESUME", "Go back to where the job was paused, and let it go on", self._resume),
-            ("CANCEL_PRINT", "End the job", self._cancel),
-            ("CLEAR_PAUSE", "Forget that there was a pause", self._clear),
+            ("RESUME", "Move back to where the job was paused and resume it", self._resume),
+            ("CANCEL_PRINT", "Cancel the job", self._cancel),
+            ("CLEAR_PAUSE", "Clear the paused state without resuming", self._clear),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def status(self) -> Mapping[str, Value]:
-        """Return whether there is a pause."""
+        """Report whether there is a pause."""
         return {"is_paused": self._paused}
 
     def job_begins(self) -> None:
@@ -56,11 +57,11 @@ class PauseResume(Module):
         self._paused = False
 
     def resumed(self) -> None:
-        """Take note that the job goes on, by whatever means."""
+        """Record that the job goes on, whatever resumed it."""
         self._paused = False
 
     def _pause(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(job: ProgramContext) -> bool:
             if self._paused and (job.prints is None or job.prints.paused):
@@ -74,10 +75,10 @@ class PauseResume(Module):
                 job.notice("PAUSE", "there is no job to pause: only a service (canductor run) has jobs")
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _resume(self, call: Call) -> Reading:
-        values = parameters(call.command, ("VELOCITY",))
+        values = call.parameters("VELOCITY")
         speed = bounded(call.command, values, "VELOCITY", self._velocity_mm_s, low=0.001, high=10_000.0)
 
         def act(job: ProgramContext) -> bool:
@@ -92,10 +93,10 @@ class PauseResume(Module):
                 prints.resume_job()
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _cancel(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(job: ProgramContext) -> bool:
             self._paused = False
@@ -103,13 +104,13 @@ class PauseResume(Module):
                 job.prints.cancel_job(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _clear(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(_job: ProgramContext) -> bool:
             self._paused = False
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)

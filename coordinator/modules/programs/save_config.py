@@ -1,29 +1,24 @@
-"""SAVE_CONFIG, RESTART and FIRMWARE_RESTART: what was calibrated is kept, and the machine restarts."""
+"""SAVE_CONFIG, RESTART and FIRMWARE_RESTART."""
 
 import asyncio
 
-from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 
 class SaveConfig(Module):
-    """The commands that end one life of the machine."""
-
-    SPEC = SectionSpec(help="Saving and restarting", options=())
+    """The commands that restart the machine."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "configfile"
-        self._live: ModuleContext | None = None
         for name, text, read in (
             (
                 "SAVE_CONFIG",
-                "Write what was calibrated into the configuration file, then restart",
+                "Write calibrated values into the configuration file, then restart",
                 self._read_save,
             ),
             (
@@ -33,15 +28,11 @@ class SaveConfig(Module):
             ),
             (
                 "FIRMWARE_RESTART",
-                "Do that with all nodes reset, also those whose configuration is the same",
+                "RESTART with a reset of all nodes, also of those whose configuration is the same",
                 lambda call: self._read_restart(call, firmware=True),
             ),
         ):
-            build.add_command(GCodeCommand(name, text, read))
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
+            build.add_command(name, text, read)
 
     def status(self) -> dict[str, Value]:
         """Report what SAVE_CONFIG would write."""
@@ -60,21 +51,19 @@ class SaveConfig(Module):
         return AtStandstill(lambda: self._restart(firmware=firmware))
 
     async def _save(self) -> Done | None:
-        assert self._live is not None
-        machine = self._live.machine
+        machine = self.live.machine
         if not machine.unsaved.pending:
             return Done(("nothing to save: nothing was calibrated since the machine started",))
         restart = machine.prepare_restart() if machine.prepare_restart is not None else None
         path = await asyncio.to_thread(machine.unsaved.write)
         if restart is None:
             return Done((f"saved into {path}; it counts from the next start on",))
-        self._live.say(f"saved into {path}; the machine restarts")
+        self.live.say(f"saved into {path}; the machine restarts")
         restart(False)
         return None
 
     async def _restart(self, *, firmware: bool) -> None:
-        assert self._live is not None
-        prepare = self._live.machine.prepare_restart
+        prepare = self.live.machine.prepare_restart
         if prepare is None:
             raise CanductorError(
                 "a machine that runs a single file cannot restart; start the command again, or serve the"

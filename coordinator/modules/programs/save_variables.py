@@ -1,8 +1,7 @@
-"""[save_variables]: values that outlive the machine, in a file of their own.
+"""[save_variables]: variables that survive a restart, in a file of their own.
 
-The file is written by a thread, so that neither programs nor the control loop wait for a disk; whole or not
-at all, so that a power cut leaves the old values or the new ones. A machine that is only planned keeps what
-it is told in memory.
+The file is written by a thread, so that neither programs nor the control loop wait for a disk; atomically, so
+that a power cut leaves the old values or the new ones. A machine that is only planned keeps them in memory.
 """
 
 import threading
@@ -12,11 +11,11 @@ from typing import Any, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec, TextOption
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
+from coordinator.gcode.parameters import needed
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
-from coordinator.modules.words import needed, parameters
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.atomic_file import atomic_write
 from coordinator.support.quoting import shown_path
@@ -32,7 +31,8 @@ _HEADER: Final = "[Variables]"
 class SaveVariables(Module):
     """The values, and the file that has them."""
 
-    SPEC = SectionSpec("Values that are kept in a file (SAVE_VARIABLE)", (FILENAME,))
+    KIND = "save_variables"
+    SPEC = SectionSpec("Variables that are kept in a file (SAVE_VARIABLE)", (FILENAME,))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -42,9 +42,7 @@ class SaveVariables(Module):
         self._variables: dict[str, Any] = {}
         self._writer: _Writer | None = None
         build.add_command(
-            GCodeCommand(
-                "SAVE_VARIABLE", "Keep VALUE as VARIABLE in the file", self._save, while_printing=True
-            )
+            "SAVE_VARIABLE", "Save VALUE as VARIABLE in the file", self._save, while_printing=True
         )
 
     def link(self, modules: Modules) -> None:  # noqa: ARG002
@@ -69,7 +67,7 @@ class SaveVariables(Module):
         return {"variables": {name: plain(value) for name, value in dict(self._variables).items()}}
 
     def _save(self, call: Call) -> Reading:
-        values = parameters(call.command, ("VARIABLE", "VALUE"))
+        values = call.parameters("VARIABLE", "VALUE")
         name, text = (needed(call.command, values, key) for key in ("VARIABLE", "VALUE"))
         if not name.isidentifier() or not name.isascii():
             raise WordError(f"VARIABLE of SAVE_VARIABLE is {quoted(name)}; write letters, digits and _")

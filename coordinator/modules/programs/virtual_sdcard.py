@@ -1,4 +1,4 @@
-"""[virtual_sdcard]: the job folder as the memory card of old: SDCARD_PRINT_FILE, M20 to M27."""
+"""[virtual_sdcard]: the job folder as a memory card: SDCARD_PRINT_FILE, M20 to M27."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -7,19 +7,18 @@ from typing import Final
 from coordinator.config.options import GCodeOption, SectionSpec, TextOption
 from coordinator.gcode.commands import (
     Call,
-    GCodeCommand,
     Immediate,
+    ProgramAction,
     ProgramContext,
     Reading,
     Recovering,
-    ToProgram,
 )
+from coordinator.gcode.parameters import bounded, flag, needed
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
-from coordinator.modules.words import bounded, flag, needed, parameters
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
@@ -29,14 +28,15 @@ PATH = TextOption(
     " home",
 )
 ON_ERROR = GCodeOption(
-    name="on_error_gcode", help="What is done when a line of a job cannot be carried out", default=""
+    name="on_error_gcode", help="What is run when a line of a job cannot be carried out", default=""
 )
-_BUSY: Final = "a job is on its way; wait for its end, or cancel it"
+_BUSY: Final = "a job is active; wait for its end, or cancel it"
 
 
 class VirtualSdcard(Module):
     """Its commands; the service has the files."""
 
+    KIND = "virtual_sdcard"
     SPEC = SectionSpec("Files that are printed", (PATH, ON_ERROR), unsupported=("with_subdirs",))
 
     def __init__(self, build: Build) -> None:
@@ -54,22 +54,22 @@ class VirtualSdcard(Module):
         self._selected = ""
         for name, help_, read, while_printing in (
             ("SDCARD_PRINT_FILE", "Print the file FILENAME", self._print, False),
-            ("SDCARD_RESET_FILE", "Forget the file that was printed", self._reset, False),
+            ("SDCARD_RESET_FILE", "Clear the selected file", self._reset, False),
             ("M20", "List the files", self._list, False),
-            ("M21", "Say that there are files", self._init, True),
-            ("M23", "Choose a file", self._select, False),
-            ("M24", "Print the chosen file, or let the paused job go on", self._start, True),
+            ("M21", "Report that files can be printed", self._init, True),
+            ("M23", "Select a file", self._select, False),
+            ("M24", "Print the selected file, or resume the paused job", self._start, True),
             ("M25", "Pause the job", self._pause, True),
-            ("M26", "Choose where to begin in the file: only S0, its begin", self._seek, False),
-            ("M27", "Report how much of the job is read", self._tell, True),
-            ("RESUME_INTERRUPTED", "Go on with a job that a crash has ended", self._recover, False),
-            ("_ON_ERROR_GCODE", "What is done when a job failed", self._failed, False),
+            ("M26", "Set where to begin in the file: only S0, its begin", self._seek, False),
+            ("M27", "Report how much of the job is read", self._report, True),
+            ("RESUME_INTERRUPTED", "Resume a job that was interrupted by a crash", self._recover, False),
+            ("_ON_ERROR_GCODE", "Run on_error_gcode", self._failed, False),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=while_printing))
+            build.add_command(name, help_, read, while_printing=while_printing)
 
     def status(self) -> Mapping[str, Value]:
         """Report which file is printed, and how far it is read."""
-        name = self._stats.told["filename"] or None
+        name = self._stats.job["filename"] or None
         return {
             **self.place,
             "file_path": name,
@@ -77,9 +77,9 @@ class VirtualSdcard(Module):
         }
 
     def _print(self, call: Call) -> Reading:
-        values = parameters(call.command, ("FILENAME",))
+        values = call.parameters("FILENAME")
         name = needed(call.command, values, "FILENAME").lstrip("/")
-        return ToProgram(lambda job: self._begin(job, name))
+        return ProgramAction(lambda job: self._begin(job, name))
 
     def _begin(self, job: ProgramContext, name: str) -> bool:
         prints = job.prints
@@ -99,7 +99,7 @@ class VirtualSdcard(Module):
             raise WordError(str(error)) from None
 
     def _reset(self, call: Call) -> Reading:
-        parameters(call.command, ())
+        call.parameters()
 
         def act(job: ProgramContext) -> bool:
             if job.prints is not None and job.prints.job_is_active:
@@ -108,7 +108,7 @@ class VirtualSdcard(Module):
             self._stats.forget()
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _list(self, _call: Call) -> Reading:
         try:
@@ -137,10 +137,10 @@ class VirtualSdcard(Module):
                 job.prints.resume_job()
                 return True
             if not self._selected:
-                raise WordError("M24 comes before a file is chosen; choose one with M23")
+                raise WordError("M24 comes before a file is selected; select one with M23")
             return self._begin(job, self._selected)
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _pause(self, _call: Call) -> Reading:
         def act(job: ProgramContext) -> bool:
@@ -148,7 +148,7 @@ class VirtualSdcard(Module):
                 job.prints.pause_job(job)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _seek(self, call: Call) -> Reading:
         if call.command.words().get("S", "0") not in {"", "0"}:
@@ -158,7 +158,7 @@ class VirtualSdcard(Module):
             )
         return Immediate()
 
-    def _tell(self, _call: Call) -> Reading:
+    def _report(self, _call: Call) -> Reading:
         if self._stats.state not in ("printing", "paused"):
             return Immediate(("Not SD printing.",), kind=ReplyKind.PLAIN)
         place = self.place
@@ -167,7 +167,7 @@ class VirtualSdcard(Module):
         )
 
     def _recover(self, call: Call) -> Reading:
-        values = parameters(call.command, ("LINE", "HOME", "Z"))
+        values = call.parameters("LINE", "HOME", "Z")
         line = bounded(call.command, values, "LINE", None, low=1, high=1e9)
         z_mm = bounded(call.command, values, "Z", None, low=-1e6, high=1e6)
         how = Recovering(None if line is None else int(line), flag(call.command, values, "HOME"), z_mm)
@@ -181,7 +181,7 @@ class VirtualSdcard(Module):
                 job.prints.recover_job(how)
             return True
 
-        return ToProgram(act)
+        return ProgramAction(act)
 
     def _failed(self, call: Call) -> Reading:
         return self.on_error.lines(call, {})

@@ -1,16 +1,15 @@
-"""[filament_switch_sensor NAME]: a switch that is pressed while there is filament; without it jobs pause."""
+"""[filament_switch_sensor NAME]: a switch that detects filament; jobs pause when it runs out."""
 
 from collections.abc import Mapping
 from typing import Final
 
 from coordinator.config.options import BoolOption, FloatOption, GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
+from coordinator.gcode.parameters import flag, needed, one
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
-from coordinator.modules.words import flag, needed, one, parameters
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.button import Button
@@ -20,19 +19,19 @@ PIN: Final = PinOption(
 )
 PAUSE: Final = BoolOption(
     name="pause_on_runout",
-    help="whether a job pauses, by PAUSE if there is [pause_resume]; if not, it goes on behind runout_gcode,"
+    help="whether a job pauses, by PAUSE if there is [pause_resume]; if not, it goes on after runout_gcode,"
     " unless that pauses it",
     default=True,
 )
 RUNOUT: Final = GCodeOption(
-    name="runout_gcode", help="What is done when a job runs out of filament", default=""
+    name="runout_gcode", help="What is run when a job runs out of filament", default=""
 )
 INSERT: Final = GCodeOption(
-    name="insert_gcode", help="What is done when filament comes while no job prints", default=""
+    name="insert_gcode", help="What is run when filament is inserted while no job prints", default=""
 )
 EVENT_DELAY: Final = FloatOption(
     name="event_delay",
-    help="How long after an event, and after the start, others are passed over",
+    help="How long after an event, and after the start, further events are ignored",
     default=3.0,
     unit="s",
     minimum=0.0,
@@ -54,8 +53,9 @@ _INSERT: Final = "_FILAMENT_INSERT"
 class FilamentSwitchSensor(Module):
     """One sensor."""
 
+    KIND = "filament_switch_sensor"
     SPEC = SectionSpec(
-        "A switch that tells whether there is filament",
+        "A switch that detects filament",
         (PIN, PAUSE, RUNOUT, INSERT, EVENT_DELAY),
         unsupported=LATER,
     )
@@ -72,11 +72,10 @@ class FilamentSwitchSensor(Module):
         self._stats = build.shared(PrintStats)
         self._can_pause = False
         self._quiet_until_s = 0.0
-        self._live: ModuleContext | None = None
         pin = build.pin(PIN)
         self.switch = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
         self.switch.on_change = self._changed
-        add_pinned(build, self.switch, pin)
+        build.add_device(pin.node, self.switch, pin)
         build.shared(FilamentSensors)
 
     def link(self, modules: Modules) -> None:
@@ -84,16 +83,16 @@ class FilamentSwitchSensor(Module):
         self._can_pause = modules.knows("PAUSE")
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Act from now on."""
-        self._live = live
+        """Start acting."""
+        await super().connect(live)
         self._quiet_until_s = live.now_s() + self._delay_s
 
-    def stopped(self, cause: str) -> None:  # noqa: ARG002
-        """Act no more."""
+    def end(self, cause: str) -> None:  # noqa: ARG002
+        """Stop acting."""
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
-        """Return whether there is filament, and whether that counts."""
+        """Report whether there is filament, and whether the sensor is enabled."""
         return {"filament_detected": self.switch.pressed, "enabled": self.enabled}
 
     def _changed(self, there: bool) -> None:
@@ -107,36 +106,31 @@ class FilamentSwitchSensor(Module):
         if there:
             runner.run_lines(self.name, [f"{_INSERT} SENSOR={self.id}"], self.insert.text)
             return
-        live.say(f"{self.name}: there is no filament any more")
+        live.say(f"{self.name}: the filament has run out")
         lines = ["PAUSE"] if self._pauses and self._can_pause else []
         runner.run_paused(self.name, [*lines, f"{_RUNOUT} SENSOR={self.id}"], stay=self._pauses)
 
 
 class FilamentSensors(Module):
-    """The commands of all."""
-
-    SPEC = SectionSpec("Commands about filament sensors", ())
+    """The commands for all sensors."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._all: dict[str, FilamentSwitchSensor] = {}
         for name, help_, read in (
             ("QUERY_FILAMENT_SENSOR", "Report whether SENSOR has filament", self._query),
-            ("SET_FILAMENT_SENSOR", "Let SENSOR count (ENABLE=1) or not (0)", self._set),
-            (_RUNOUT, "What is done when filament runs out", self._runout),
-            (_INSERT, "What is done when filament comes", self._insert),
+            ("SET_FILAMENT_SENSOR", "Enable SENSOR (ENABLE=1) or disable it (0)", self._set),
+            (_RUNOUT, "Run runout_gcode", self._runout),
+            (_INSERT, "Run insert_gcode", self._insert),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def link(self, modules: Modules) -> None:
-        """Find them."""
-        for name in modules.names(FilamentSwitchSensor):
-            found = modules.find(name, FilamentSwitchSensor)
-            assert found is not None
-            self._all[found.id] = found
+        """Find all sections."""
+        self._all = {found.id: found for found in modules.of(FilamentSwitchSensor)}
 
     def _sensor(self, call: Call, *others: str) -> tuple[FilamentSwitchSensor, Mapping[str, str]]:
-        given = parameters(call.command, ("SENSOR", *others))
+        given = call.parameters("SENSOR", *others)
         return self._all[one(call.command, given, "SENSOR", self._all)], given
 
     def _query(self, call: Call) -> Reading:

@@ -1,7 +1,7 @@
 """Temperatures without a pin: of a node's own chip, of the host's computer, of several sensors together.
 
-No node watches over them, so no heater may depend upon them; the host stops the machine when they leave their
-min_temp and max_temp.
+No node checks them, so no heater may depend on them; the host stops the machine when they leave min_temp and
+max_temp.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.quoting import nearest, shown
+from coordinator.support.quoting import nearest_or_all, shown
 from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.node import Node
@@ -36,7 +36,7 @@ from nodes.support.errors import CanductorError
 LOWEST_C: Final = -273.15
 HIGHEST_C: Final = 1500.0
 CHIP_PIN: Final = "ADC_TEMPERATURE"
-"""What firmware calls the channel of the chip's own sensor."""
+"""Name of the channel of the chip's own sensor in firmware."""
 HOST_S: Final = 1.0
 COMBINED_S: Final = 0.3
 HALF_WORD: Final = 1
@@ -50,7 +50,7 @@ class ChipTemperature(TemperatureSource):
         self._node = build.get(SENSOR_MCU)
         names = [node.name for node in build.machine.nodes]
         if self._node not in names:
-            hint = nearest(self._node, names) or f"; there is {', '.join(names)}"
+            hint = nearest_or_all(self._node, names)
             raise build.reader.bad(SENSOR_MCU, f"but there is no node {shown(self._node)}{hint}")
         self._own = _own_line(build)
         self._chip: ChipSensor | None = None
@@ -78,7 +78,7 @@ class ChipTemperature(TemperatureSource):
         self._analog.configure(config)
 
     def started(self, node: "Node") -> None:
-        """Begin to measure, as NODE has become ready."""
+        """Start measuring: NODE has become ready."""
         self._analog.started(node)
 
     @property
@@ -87,7 +87,7 @@ class ChipTemperature(TemperatureSource):
         return self._node
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to tell; ask the chip for what its factory measured."""
+        """Start reporting; read the calibration values of the chip's factory."""
         await super().connect(live)
         node = live.node(self._node)
         if node.state is not NodeState.READY:
@@ -131,14 +131,14 @@ def _own_line(build: Build) -> ChipLine | None:
 
 
 class HostTemperature(TemperatureSource):
-    """The temperature of the host's computer, which its kernel tells in a file."""
+    """The temperature of the host's computer, from a file of its kernel."""
 
     def __init__(self, build: Build, min_c: float, max_c: float) -> None:
         super().__init__(build.name, min_c, max_c)
         self._path = Path(build.get(SENSOR_PATH))
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to look; CanductorError when there is nothing to see."""
+        """Start reading; raises CanductorError when the file cannot be read."""
         await super().connect(live)
         self._look()
         live.every(HOST_S, self._look_again)
@@ -173,7 +173,7 @@ class HostTemperature(TemperatureSource):
 
 
 class CombinedTemperature(TemperatureSource):
-    """What is made of the temperatures of other sections."""
+    """The minimum, maximum or mean of the temperatures of other sections."""
 
     def __init__(self, build: Build, min_c: float, max_c: float) -> None:
         super().__init__(build.name, min_c, max_c)
@@ -192,7 +192,7 @@ class CombinedTemperature(TemperatureSource):
             source = known.get(name)
             if source is None or source is self:
                 others = [other for other in known if known[other] is not self]
-                hint = nearest(name, others) or f"; there is {', '.join(others) or 'none'}"
+                hint = nearest_or_all(name, others)
                 why = "this section itself" if source is self else f"{shown(name)}, which does not exist"
                 raise ConfigError(
                     self._reader.place_of(SENSOR_LIST), f"'sensor_list' of [{self.name}] names {why}{hint}"
@@ -200,7 +200,7 @@ class CombinedTemperature(TemperatureSource):
             self._sources.append(source)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to look."""
+        """Start the periodic calculation."""
         await super().connect(live)
         live.every(COMBINED_S, self._look)
 
@@ -212,10 +212,10 @@ class CombinedTemperature(TemperatureSource):
             return
         apart = max(known) - min(known)
         if self._deviation_k is not None and apart > self._deviation_k:
-            told = ", ".join(f"{s.name} {c:.1f} °C" for s, c in zip(self._sources, known, strict=True))
+            listed = ", ".join(f"{s.name} {c:.1f} °C" for s, c in zip(self._sources, known, strict=True))
             live.stop(
                 f"[{self.name}]: its sensors are {apart:.1f} K apart, more than maximum_deviation"
-                f" ({self._deviation_k:g} K): {told}; find out which of them is wrong"
+                f" ({self._deviation_k:g} K): {listed}; find out which of them is wrong"
             )
             return
         values = {"min": min(known), "max": max(known), "mean": sum(known) / len(known)}

@@ -1,22 +1,20 @@
-"""[gcode_button NAME]: g-code that is run when a button is pressed, or let go."""
+"""[gcode_button NAME]: g-code that is run when a button is pressed or released."""
 
 from collections.abc import Mapping
 from typing import Final
 
 from coordinator.config.options import GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
+from coordinator.gcode.parameters import flag, one
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
-from coordinator.modules.words import flag, one, parameters
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.button import Button
 
 PIN: Final = PinOption(name="pin", help="input of the button; pressed is high, with ! low", pullable=True)
-PRESS: Final = GCodeOption(name="press_gcode", help="What is done when it is pressed")
-RELEASE: Final = GCodeOption(name="release_gcode", help="What is done when it is let go", default="")
+PRESS: Final = GCodeOption(name="press_gcode", help="What is run when it is pressed")
+RELEASE: Final = GCodeOption(name="release_gcode", help="What is run when it is released", default="")
 LATER: Final = ("analog_range", "analog_pullup_resistor", "debounce_delay")
 _COMMAND: Final = "_BUTTON"
 
@@ -24,6 +22,7 @@ _COMMAND: Final = "_BUTTON"
 class GCodeButton(Module):
     """One button; a service runs its lines as those of a client."""
 
+    KIND = "gcode_button"
     SPEC = SectionSpec("A button that runs g-code", (PIN, PRESS, RELEASE), unsupported=LATER)
     NAMED = True
 
@@ -35,20 +34,15 @@ class GCodeButton(Module):
         pin = build.pin(PIN)
         self._button = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
         self._button.on_change = self._changed
-        self._live: ModuleContext | None = None
-        add_pinned(build, self._button, pin)
+        build.add_device(pin.node, self._button, pin)
         build.shared(GCodeButtons)
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Act from now on."""
-        self._live = live
-
-    def stopped(self, cause: str) -> None:  # noqa: ARG002
-        """Act no more."""
+    def end(self, cause: str) -> None:  # noqa: ARG002
+        """Stop acting."""
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
-        """Return whether it is pressed."""
+        """Report whether it is pressed."""
         return {"state": "PRESSED" if self._button.pressed else "RELEASED"}
 
     def _changed(self, pressed: bool) -> None:
@@ -63,31 +57,26 @@ class GCodeButton(Module):
 
 
 class GCodeButtons(Module):
-    """The commands of all."""
-
-    SPEC = SectionSpec("Commands about buttons", ())
+    """The commands for all buttons."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._all: dict[str, GCodeButton] = {}
         build.add_command(
-            GCodeCommand("QUERY_BUTTON", "Report whether BUTTON is pressed", self._query, while_printing=True)
+            "QUERY_BUTTON", "Report whether BUTTON is pressed", self._query, while_printing=True
         )
-        build.add_command(GCodeCommand(_COMMAND, "What a button does", self._run, while_printing=True))
+        build.add_command(_COMMAND, "Run the g-code of a button", self._run, while_printing=True)
 
     def link(self, modules: Modules) -> None:
-        """Find them."""
-        for name in modules.names(GCodeButton):
-            found = modules.find(name, GCodeButton)
-            assert found is not None
-            self._all[found.id] = found
+        """Find all sections."""
+        self._all = {found.id: found for found in modules.of(GCodeButton)}
 
     def _query(self, call: Call) -> Reading:
-        name = one(call.command, parameters(call.command, ("BUTTON",)), "BUTTON", self._all)
+        name = one(call.command, call.parameters("BUTTON"), "BUTTON", self._all)
         return Immediate((f"{name}: {self._all[name].status()['state']}",))
 
     def _run(self, call: Call) -> Reading:
-        given = parameters(call.command, ("BUTTON", "PRESSED"))
+        given = call.parameters("BUTTON", "PRESSED")
         found = self._all[one(call.command, given, "BUTTON", self._all)]
         pressed = flag(call.command, given, "PRESSED")
         return (found.press if pressed else found.release).lines(call, {})

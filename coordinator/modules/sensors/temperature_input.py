@@ -27,7 +27,6 @@ from coordinator.heat.resistors import SensorError
 from coordinator.heat.sensors import AmplifiedPullUp, PullUp, Sensor, ratio_range
 from coordinator.heat.thermocouples import AMPLIFIERS, amplifier
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.pinned import add_pinned
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.sensors.thermistor import KINDS, Circuit, CustomSensor
 from coordinator.runtime.module_context import ModuleContext
@@ -65,10 +64,10 @@ class TemperatureInput(TemperatureSource):
         self._sensor: Sensor | None = None
         self._analog = AnalogIn(build.name, pin=self._pin.name)
         self._analog.on_value = self._came
-        add_pinned(build, self._analog, self._pin)
+        build.add_device(self._pin.node, self._analog, self._pin)
 
     def link(self, modules: Modules) -> None:
-        """Find out what the sensor is, and what its converter may read; raises ConfigError."""
+        """Find the sensor, and what its converter may read; raises ConfigError."""
         self._sensor = self._find(modules)
         if not self._guarded:
             return
@@ -99,17 +98,17 @@ class TemperatureInput(TemperatureSource):
         if self._type in FREE_SENSORS:
             return self._reader.bad(
                 SENSOR_TYPE,
-                "which no node can watch: a heater needs a sensor on a pin, with a net of its own",
+                "which no node can check: a heater needs a sensor on a pin, whose limits its node checks",
             )
         own = [name.partition(" ")[2] for kind in KINDS.values() for name in modules.names(kind)]
         hint = nearest(self._type, (*KNOWN_SENSORS, *own), pattern="'{}'")
         add = f"; add a section [thermistor {self._type}]"
         return self._reader.bad(SENSOR_TYPE, f"but there is no sensor {shown(self._type)}{hint or add}")
 
-    # ---------------------------------------------------------------------------------------------- live
+    # ----------------------------------------------------------------------------------------- connected
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to tell what is measured; waits for the first time, unless its node is away."""
+        """Start reporting measurements; waits for the first one, unless its node is absent."""
         await super().connect(live)
         if self.celsius is None and live.node(self._pin.node).state is NodeState.READY:
             await self.next()

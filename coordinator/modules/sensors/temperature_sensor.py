@@ -1,4 +1,4 @@
-"""[temperature_sensor NAME]: a temperature that is only watched."""
+"""[temperature_sensor NAME]: a temperature that is only reported."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Final
@@ -18,7 +18,7 @@ from coordinator.support.values import Value
 
 GCODE_ID: Final = TextOption(
     name="gcode_id",
-    help="what M105 calls it; without one it does not tell it",
+    help="its name in M105; without one M105 does not report it",
     pattern=r"[A-Za-z][A-Za-z0-9_]*",
     pattern_rule="a letter, and letters and digits",
 )
@@ -27,9 +27,10 @@ GCODE_ID: Final = TextOption(
 class TemperatureSensor(SensorModule):
     """A sensor of no heater."""
 
+    KIND = "temperature_sensor"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="A temperature that is watched; with min_temp or max_temp its node stops all outside them",
+        help="A temperature that is reported; outside min_temp or max_temp its node stops the machine",
         options=(*SENSOR_OPTIONS, *FREE_SENSOR_OPTIONS, GCODE_ID),
         unsupported=UNSUPPORTED_SENSOR_OPTIONS,
     )
@@ -46,16 +47,12 @@ class TemperatureSensor(SensorModule):
         self.input.link(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to measure."""
+        """Start measuring."""
         await self.input.connect(live)
 
-    def stopped(self, cause: str) -> None:
-        """Measure no more."""
+    def end(self, cause: str) -> None:
+        """Stop measuring."""
         self.input.end(cause)
-
-    def close(self) -> None:
-        """Measure no more."""
-        self.input.end("the machine was closed")
 
     def _measured(self, _at_s: float, celsius: float) -> None:
         low, high = self._extremes or (celsius, celsius)

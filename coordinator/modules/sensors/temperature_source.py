@@ -1,4 +1,4 @@
-"""A temperature that is measured again and again, wherever it comes from, and those who wait for it."""
+"""A temperature that is measured periodically, whatever its source, and the tasks that wait for it."""
 
 import asyncio
 from collections.abc import Callable
@@ -9,11 +9,11 @@ from coordinator.runtime.module_context import ModuleContext
 from nodes.support.errors import CanductorError
 
 SILENT_S: Final = 10.0
-"""Who waits for a measurement that should come three times a second gives up after so long; a host may stand
-still for a while."""
+"""How long a task waits for a measurement, which should come three times a second; a host may be suspended
+for a while."""
 MAX_WAITERS: Final = 64
 BAD_IN_A_ROW: Final = 6
-"""So many measurements outside the limits, where no node watches over them, stop the machine."""
+"""How many measurements in a row outside the limits stop the machine, where no node checks them."""
 
 OnMeasured = Callable[[float, float], None]
 """Print time in s, °C."""
@@ -35,10 +35,10 @@ class TemperatureSource:
         self.celsius: float | None = None
         """The last measurement; None before the first."""
         self.sound_c: float | None = None
-        """The last measurement within the limits; one outside is of a broken wire, or of noise."""
+        """The last measurement within the limits; one outside comes from a broken wire, or from noise."""
         self.on_measured: OnMeasured = _ignore
         self.ratio: float | None = None
-        """What its converter read last, 0 to 1; None: nothing yet, or there is none."""
+        """The last reading of its converter, 0 to 1; None: none yet, or there is no converter."""
         self._live: ModuleContext | None = None
         self._looks = 0
         self._bad = 0
@@ -49,11 +49,11 @@ class TemperatureSource:
         """Find what belongs to it; raises ConfigError."""
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to tell what is measured."""
+        """Start reporting measurements."""
         self._live = live
 
     def end(self, cause: str) -> None:
-        """End all waiting for it, because of CAUSE."""
+        """Stop reporting and end all waiting, because of CAUSE."""
         self._over = cause
         self._live = None
         self.wake()
@@ -86,7 +86,7 @@ class TemperatureSource:
                 await waiter
         except TimeoutError:
             there = f"; is its node {self.node} there?" if self.node else ""
-            raise CanductorError(f"the sensor of [{self.name}] says nothing any more{there}") from None
+            raise CanductorError(f"the sensor of [{self.name}] is silent{there}") from None
         finally:
             if waiter in self._waiting:
                 self._waiting.remove(waiter)
@@ -94,7 +94,7 @@ class TemperatureSource:
             raise CanductorError(self._over)
 
     def _take(self, celsius: float, at_s: Callable[["ModuleContext"], float]) -> None:
-        """Take a measurement; AT_S tells its print time on a machine that lives."""
+        """Take a measurement; AT_S returns its print time on a connected machine."""
         self.celsius = celsius
         if self.min_c <= celsius <= self.max_c:
             self.sound_c = celsius
@@ -104,16 +104,16 @@ class TemperatureSource:
         self.wake()
 
     def _watch(self, live: "ModuleContext", celsius: float) -> None:
-        """Stop the machine when CELSIUS stays outside the limits: for sensors that no node watches."""
+        """Stop the machine when CELSIUS stays outside the limits: for sensors that no node checks."""
         self._bad = 0 if self.min_c <= celsius <= self.max_c else self._bad + 1
         if self._bad == BAD_IN_A_ROW:
             live.stop(
-                f"[{self.name}] tells {celsius:.0f} °C, outside its min_temp of {self.min_c:g} and max_temp"
+                f"[{self.name}] reads {celsius:.0f} °C, outside its min_temp of {self.min_c:g} and max_temp"
                 f" of {self.max_c:g} °C; find out why, or correct these"
             )
 
     def wake(self) -> None:
-        """Let all who wait for a measurement go on and look again."""
+        """Wake all that wait for a measurement."""
         for waiter in self._waiting:
             if not waiter.done():
                 waiter.set_result(None)

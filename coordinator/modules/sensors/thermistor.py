@@ -66,6 +66,7 @@ BETA: Final = FloatOption(
 class Thermistor(CustomSensor):
     """A thermistor by three points, or by one and beta."""
 
+    KIND = "thermistor"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A thermistor of your own, by three of its points (Steinhart-Hart) or by one and beta; sections"
@@ -98,6 +99,7 @@ ADC_POINTS: Final = tuple((_temperature(n), _volts(n), _ohms(n)) for n in range(
 class AdcTemperature(CustomSensor):
     """A sensor by its voltages or its resistances at some temperatures."""
 
+    KIND = "adc_temperature"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A sensor of your own, by its voltages or its resistances at 2 to 40 temperatures, with straight"
@@ -134,7 +136,7 @@ def _given(build: Build) -> Iterator[tuple[float, bool, float]]:
         if at is None or value is None or (v is not None and r is not None):
             raise ConfigError(
                 build.place,
-                f"[{build.name}]: '{celsius.name}' needs either '{volts.name}' or '{ohms.name}' beside it",
+                f"[{build.name}]: '{celsius.name}' needs either '{volts.name}' or '{ohms.name}' as well",
             )
         if kind is not None and kind is not (v is not None):
             raise ConfigError(build.place, f"[{build.name}] mixes voltages and resistances; use one kind")

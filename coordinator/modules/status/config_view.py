@@ -1,49 +1,35 @@
 """``printer.configfile``: ``config`` has every option as text, ``settings`` as what it was read as."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from enum import Enum
-from typing import Any, Final
+from typing import Final
 
-_NAMES: Final = ("config", "settings", "save_config_pending", "save_config_pending_items", "warnings")
+from coordinator.modules.status.lazy_status import LazyStatus
 
 
-class ConfigView(Mapping[str, Any]):
-    """Options by section: CONFIG as text, SETTINGS as values and defaults. PENDING: for SAVE_CONFIG."""
+def config_view(
+    config: Mapping[str, Mapping[str, str]],
+    settings: Mapping[str, Mapping[str, object]],
+    pending: Mapping[str, object],
+) -> LazyStatus:
+    """Return options by section: CONFIG as text, SETTINGS as values and defaults; and what is PENDING."""
+    return LazyStatus(
+        config=lambda: {section: dict(options) for section, options in config.items()},
+        settings=lambda: {
+            section.lower(): _values(section, options, settings.get(section, {}))
+            for section, options in config.items()
+        },
+        save_config_pending=lambda: bool(pending.get("save_config_pending", False)),
+        save_config_pending_items=lambda: pending.get("save_config_pending_items", {}),
+        warnings=list,
+    )
 
-    def __init__(
-        self,
-        config: Mapping[str, Mapping[str, str]],
-        settings: Mapping[str, Mapping[str, object]],
-        pending: Mapping[str, object],
-    ) -> None:
-        self._config = config
-        self._settings = settings
-        self._pending = pending
 
-    def __getitem__(self, name: str) -> object:
-        if name == "config":
-            return {section: dict(options) for section, options in self._config.items()}
-        if name == "settings":
-            return {section.lower(): self._values(section) for section in self._config}
-        if name == "save_config_pending":
-            return bool(self._pending.get(name, False))
-        if name == "save_config_pending_items":
-            return self._pending.get(name, {})
-        if name == "warnings":
-            return []
-        raise KeyError(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(_NAMES)
-
-    def __len__(self) -> int:
-        return len(_NAMES)
-
-    def _values(self, section: str) -> dict[str, object]:
-        """Return values and defaults; what no reader knows stands as what it looks like."""
-        given = {option: _typed(section, option, text) for option, text in self._config[section].items()}
-        used = {option: _plain(value) for option, value in self._settings.get(section, {}).items()}
-        return given | {option: value for option, value in used.items() if value is not None}
+def _values(section: str, texts: Mapping[str, str], values: Mapping[str, object]) -> dict[str, object]:
+    """Return values and defaults; what no reader knows stands as what it looks like."""
+    given = {option: _typed(section, option, text) for option, text in texts.items()}
+    used = {option: _plain(value) for option, value in values.items()}
+    return given | {option: value for option, value in used.items() if value is not None}
 
 
 def _plain(value: object) -> object:

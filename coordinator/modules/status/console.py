@@ -1,10 +1,9 @@
-"""What people at a console ask a machine: HELP, STATUS, M115."""
+"""Commands for people at a console: HELP, STATUS, M115."""
 
 from importlib.metadata import version
 from typing import Final
 
-from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.print_stats import PrintStats
@@ -13,22 +12,20 @@ NAME: Final = "canductor"
 
 
 class Console(Module):
-    """The answers."""
-
-    SPEC = SectionSpec("What a console asks", ())
+    """The commands."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._modules: Modules | None = None
         for name, help_, read in (
-            ("HELP", "List the commands there are", self._help),
+            ("HELP", "List all commands", self._help),
             ("STATUS", "Report the machine's state", self._status),
             ("M115", "Report the firmware name and version", self._identify),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def link(self, modules: Modules) -> None:
-        """Remember who there is."""
+        """Remember the modules."""
         self._modules = modules
 
     def _help(self, call: Call) -> Reading:
@@ -45,7 +42,7 @@ class Console(Module):
         stats = None if self._modules is None else self._modules.find("print_stats", PrintStats)
         if stats is None or stats.state not in ("printing", "paused"):
             return Immediate(("ready",))
-        return Immediate((f"{stats.state} {stats.told['filename']}",))
+        return Immediate((f"{stats.state} {stats.job['filename']}",))
 
     def _identify(self, _call: Call) -> Reading:
         return Immediate((f"FIRMWARE_NAME:{NAME} FIRMWARE_VERSION:{version(NAME)}",), kind=ReplyKind.PLAIN)

@@ -1,13 +1,12 @@
-"""[display_status]: what programs say about themselves: M117 and SET_DISPLAY_TEXT, M73."""
+"""[display_status]: the message and progress that programs set: M117, SET_DISPLAY_TEXT, M73."""
 
 from collections.abc import Mapping
 from typing import Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parser import WordError, number
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import parameters
 from coordinator.support.values import Value
 
 TEXT_MAX: Final = 500
@@ -15,9 +14,10 @@ TEXT_MAX: Final = 500
 
 
 class DisplayStatus(Module):
-    """A message, and how far the program believes to be."""
+    """A message, and the progress that the program reports."""
 
-    SPEC = SectionSpec("What programs show: a message (M117) and their progress (M73)", ())
+    KIND = "display_status"
+    SPEC = SectionSpec("The message (M117) and progress (M73) that programs set", ())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -25,13 +25,13 @@ class DisplayStatus(Module):
         self._progress: float | None = None
         for name, help_, read in (
             ("M117", "Show a message", self._show),
-            ("SET_DISPLAY_TEXT", "Show MSG; without it, nothing", self._set),
-            ("M73", "Set the progress of the program: P, percent", self._tell),
+            ("SET_DISPLAY_TEXT", "Show MSG; without it, clear the message", self._set),
+            ("M73", "Set the progress of the program: P, percent", self._set_progress),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def status(self) -> Mapping[str, Value]:
-        """Report the message, and the progress of 0 to 1; None: not told."""
+        """Report the message, and the progress of 0 to 1; None: not set."""
         return {"message": self._message, "progress": self._progress}
 
     def job_begins(self) -> None:
@@ -42,7 +42,7 @@ class DisplayStatus(Module):
         return self._message_is(call.command.text.strip())
 
     def _set(self, call: Call) -> Reading:
-        return self._message_is(parameters(call.command, ("MSG",)).get("MSG", ""))
+        return self._message_is(call.parameters("MSG").get("MSG", ""))
 
     def _message_is(self, text: str) -> Reading:
         def act() -> None:
@@ -50,7 +50,7 @@ class DisplayStatus(Module):
 
         return Immediate(act=act)
 
-    def _tell(self, call: Call) -> Reading:
+    def _set_progress(self, call: Call) -> Reading:
         words = call.command.words()
         if "P" not in words:
             return Immediate()  # R alone: the minutes that are left

@@ -1,12 +1,13 @@
-"""What macros see of the machine besides its modules: nodes, the computer, the commands there are."""
+"""What macros see of the machine in addition to its modules: nodes, the computer, the commands."""
 
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from coordinator.modules.base import Modules
+from coordinator.modules.status.lazy_status import LazyStatus
 from coordinator.runtime.module_context import ModuleContext
 from nodes.node.node import Node
 from nodes.support.errors import CanductorError
@@ -14,19 +15,26 @@ from nodes.support.errors import CanductorError
 _MEMORY: Final = Path("/proc/meminfo")
 
 
-def machine_view(live: "ModuleContext | None") -> Mapping[str, Mapping[str, object]]:
+def machine_view(modules: Modules, live: "ModuleContext | None") -> Mapping[str, Mapping[str, object]]:
     """Return it by name; on the control loop. Without LIVE nothing is connected: a program is planned."""
     nodes = {} if live is None else live.machine.nodes
     stopped = None if live is None else live.machine.stopped
     runner = None if live is None else live.machine.runner
     return {
+        "gcode": LazyStatus(
+            commands=lambda: {name: {"help": text} for name, text in modules.command_help.items()}
+        ),
         **{name if name == "mcu" else f"mcu {name}": _node(node) for name, node in nodes.items()},
-        "system_stats": _Computer(),
+        "system_stats": LazyStatus(
+            sysload=lambda: round(os.getloadavg()[0], 3),
+            cputime=lambda: round(time.process_time(), 3),
+            memavail=available_kb,
+        ),
         "webhooks": {
             "state": "ready" if stopped is None else "shutdown",
             "state_message": "Printer is ready" if stopped is None else str(stopped),
         },
-        # As if there were the section: macros ask whether anything goes on.
+        # As if there were the section: macros ask whether the machine is busy.
         "idle_timeout": {
             "state": "Ready" if runner is not None and not runner.busy else "Printing",
             "printing_time": 0.0,
@@ -55,43 +63,6 @@ def _node(node: "Node") -> Mapping[str, object]:
         "mcu_build_versions": dictionary.build_versions,
         "mcu_constants": dictionary.constants,
     }
-
-
-class Commands(Mapping[str, Any]):
-    """``printer.gcode.commands``: what MODULES and the machine itself have programs know."""
-
-    def __init__(self, modules: "Modules") -> None:
-        self._modules = modules
-
-    def __getitem__(self, name: str) -> object:
-        if name != "commands":
-            raise KeyError(name)
-        return {command: {"help": text} for command, text in self._modules.command_help.items()}
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(("commands",))
-
-    def __len__(self) -> int:
-        return 1
-
-
-class _Computer(Mapping[str, Any]):
-    """``printer.system_stats``, looked at when it is asked for."""
-
-    def __getitem__(self, name: str) -> object:
-        if name == "sysload":
-            return round(os.getloadavg()[0], 3)
-        if name == "cputime":
-            return round(time.process_time(), 3)
-        if name == "memavail":
-            return available_kb()
-        raise KeyError(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(("sysload", "cputime", "memavail"))
-
-    def __len__(self) -> int:
-        return 3
 
 
 def available_kb() -> int:

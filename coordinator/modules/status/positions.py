@@ -1,44 +1,32 @@
 """GET_POSITION: where the machine is in all frames, from what the nodes count to the program's numbers."""
 
-from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.status import frames
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 
 
 class Positions(Module):
     """The command."""
 
-    SPEC = SectionSpec(help="Positions", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self._live: ModuleContext | None = None
         build.add_command(
-            GCodeCommand(
-                "GET_POSITION",
-                "Report the position in all frames; while a job prints, in those of the job",
-                self._read,
-                while_printing=True,
-            )
+            "GET_POSITION",
+            "Report the position in all frames; while a job prints, in those of the job",
+            self._read,
+            while_printing=True,
         )
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
-
     def _read(self, call: Call) -> Reading:
-        told = frames(call.figures())
+        lines = frames(call.figures())
         if call.while_printing:
-            return Immediate(told)
-        return AtStandstill(lambda: self._tell(told), Done(told))
+            return Immediate(lines)
+        return AtStandstill(lambda: self._report(lines), Done(lines))
 
-    async def _tell(self, told: tuple[str, ...]) -> Done:
-        """Answer with what the nodes count, what follows from that, and what the program was TOLD."""
-        assert self._live is not None
-        machine = self._live.machine
+    async def _report(self, lines: tuple[str, ...]) -> Done:
+        """Report what the nodes count, what follows from that, and the LINES of the program's frames."""
+        machine = self.live.machine
         counts = await machine.query_stepper_counts()
         places = machine.stepper_positions.positions(counts)
         head = machine.stepper_positions.head(places)
@@ -48,4 +36,4 @@ class Positions(Module):
         kinematic = (
             unknown if head is None else " ".join(f"{a}:{v:.6f}" for a, v in zip("XYZ", head, strict=True))
         )
-        return Done((f"mcu: {mcu}", f"stepper: {stepper or unknown}", f"kinematic: {kinematic}", *told))
+        return Done((f"mcu: {mcu}", f"stepper: {stepper or unknown}", f"kinematic: {kinematic}", *lines))

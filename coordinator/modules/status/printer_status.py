@@ -1,7 +1,7 @@
 """What macros see as ``printer``: the status of all modules, the configuration, and the moves read so far.
 
-Macros are rendered where programs are read, beside the control loop that modules live on. So the loop is
-asked for everybody's status, once for each rendering that looks at one; a loop that is late gets no more
+Macros are rendered where programs are read, in another thread than the control loop of the modules. So the
+loop is asked for the status of all, once for each rendering that uses one; a loop that is late gets no more
 than PATIENCE_S, and the status it gave last is used.
 """
 
@@ -12,12 +12,11 @@ from typing import Any, Final
 
 from jinja2 import ChainableUndefined
 
-from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import Call
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.absent_status import absent_statuses
-from coordinator.modules.status.config_view import ConfigView
-from coordinator.modules.status.machine_view import Commands, machine_view
+from coordinator.modules.status.config_view import config_view
+from coordinator.modules.status.machine_view import machine_view
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.runtime.module_context import ModuleContext
 
@@ -26,9 +25,7 @@ Shown = Mapping[str, Mapping[str, object]]
 
 
 class PrinterStatus(Module):
-    """Gathers it; shared by all who render."""
-
-    SPEC = SectionSpec("What macros see of the machine", ())
+    """Gathers the status; shared by all templates."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -37,19 +34,18 @@ class PrinterStatus(Module):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_thread = 0
         self._last: Shown = {}
-        self._live: ModuleContext | None = None
 
     def link(self, modules: Modules) -> None:
-        """Remember who there is."""
+        """Remember the modules."""
         self._modules = modules
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Ask the loop from now on."""
-        self._live = live
+        """Start asking the loop."""
+        await super().connect(live)
         self._loop, self._loop_thread = asyncio.get_running_loop(), threading.get_ident()
 
     def close(self) -> None:
-        """Ask the loop no more."""
+        """Stop asking the loop."""
         self._loop = self._live = None
 
     def call_remote(self, name: str, values: Mapping[str, object]) -> bool:
@@ -85,13 +81,13 @@ class PrinterStatus(Module):
         return self._last
 
     def _every(self, modules: Modules) -> Shown:
-        told: dict[str, Mapping[str, object]] = {"gcode": Commands(modules), **machine_view(self._live)}
-        # A section that has nothing to tell is there nevertheless: macros ask whether others are.
-        told.update(absent_statuses(modules.config))
-        told.update((name, {}) for name in modules.names(Module) if name in modules.config)
-        told.update((name, self._for_macros(status)) for name, status in modules.status().items())
-        told["configfile"] = ConfigView(modules.config, modules.settings, told.get("configfile", {}))
-        return told
+        found: dict[str, Mapping[str, object]] = dict(machine_view(modules, self._live))
+        # A section without a status is there nevertheless: macros ask whether sections exist.
+        found.update(absent_statuses(modules.config))
+        found.update((name, {}) for name in modules.names(Module) if name in modules.config)
+        found.update((name, self._for_macros(status)) for name, status in modules.status().items())
+        found["configfile"] = config_view(modules.config, modules.settings, found.get("configfile", {}))
+        return found
 
     def _for_macros(self, status: Mapping[str, object]) -> Mapping[str, object]:
         """Return STATUS with numbers that macros can compare, also where nothing was measured yet.
@@ -126,7 +122,7 @@ class PrinterView(Mapping[str, Any]):
         if self._all is None:
             seen = {name: _copy(status) for name, status in self._look().items()}
             figures = self._figures()
-            every = {**seen, **{name: {**seen.get(name, {}), **told} for name, told in figures.items()}}
+            every = {**seen, **{name: {**seen.get(name, {}), **more} for name, more in figures.items()}}
             self._all = {
                 name: Section(name, status) if isinstance(status, dict) else status
                 for name, status in every.items()
@@ -135,7 +131,7 @@ class PrinterView(Mapping[str, Any]):
 
 
 class Section(dict[str, Any]):
-    """The status of a section: what it does not tell is undefined, and so is all of that."""
+    """The status of a section: fields that it does not have are undefined, and so are their fields."""
 
     def __init__(self, name: str, status: Mapping[str, Any]) -> None:
         super().__init__(status)

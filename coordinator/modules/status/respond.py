@@ -1,22 +1,22 @@
-"""[respond]: RESPOND shows a line to the user, with a prefix that tells its kind; so does M118."""
+"""[respond]: RESPOND shows a line to the user, with a prefix for its kind; so does M118."""
 
 from coordinator.config.options import ChoiceOption, SectionSpec, TextOption
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.gcode.reply_kinds import kind_of_line
 from coordinator.modules.base import Build, Module
-from coordinator.modules.words import parameters
 
 PREFIXES = {"echo": "echo:", "command": "//", "error": "!!"}
 TYPE = ChoiceOption(
     name="default_type", help="Kind of a line without one", default="echo", choices=tuple(PREFIXES)
 )
-PREFIX = TextOption(name="default_prefix", help="Stands before a line, instead of that of default_type")
+PREFIX = TextOption(name="default_prefix", help="Prefix of a line, instead of that of default_type")
 
 
 class Respond(Module):
     """Its commands."""
 
+    KIND = "respond"
     SPEC = SectionSpec(
         "Lines that programs show to the user", (TYPE, PREFIX), unsupported=("enable_respond",)
     )
@@ -25,18 +25,16 @@ class Respond(Module):
         super().__init__(build)
         usual = PREFIXES[build.get(TYPE)]
         self._prefix = build.find(PREFIX) or usual
-        build.add_command(GCodeCommand("M118", "Show a line", self._echo, while_printing=True))
+        build.add_command("M118", "Show a line", self._echo, while_printing=True)
         build.add_command(
-            GCodeCommand(
-                "RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, while_printing=True
-            )
+            "RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, while_printing=True
         )
 
     def _echo(self, call: Call) -> Reading:
         return _line(f"{self._prefix} {call.command.text.strip()}")
 
     def _respond(self, call: Call) -> Reading:
-        values = parameters(call.command, ("TYPE", "PREFIX", "MSG"))
+        values = call.parameters("TYPE", "PREFIX", "MSG")
         prefix = self._prefix
         if "TYPE" in values:
             kind = values["TYPE"].lower()

@@ -58,7 +58,7 @@ _ARC_FAULTS: Final[Mapping[ArcFault, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class SuspendedProgram:
-    """How far the line at hand was, while other lines come between."""
+    """How far the present line was, while other lines are run."""
 
     lines: int
     left_out: int
@@ -67,7 +67,7 @@ class SuspendedProgram:
     position: Position
     base_e: float
     real_e: float
-    """Of the machine, whatever the program believes."""
+    """Of the machine, not of the program."""
 
 
 def gcode_words(words: Mapping[str, float]) -> Any:

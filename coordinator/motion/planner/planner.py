@@ -407,7 +407,7 @@ class Planner:
         self._core.limits.position_max[axis] = check_number("position_max", high, -1e6, 1e9)
 
     def limit_axes(self, what: str, values: Mapping[str, float]) -> None:
-        """Let X, Y, Z and filament alone (E) have at most VALUES of WHAT: ``velocity`` or ``accel``; mm, s.
+        """Limit X, Y, Z and filament alone (E) to VALUES of WHAT: ``velocity`` or ``accel``; mm, s.
 
         Never more than is configured; raises ValueError.
         """
@@ -435,7 +435,7 @@ class Planner:
 
     @property
     def gcode_offset(self) -> Position:
-        """By how much the G-code origin is shifted beside G92 (SET_GCODE_OFFSET), mm; homing keeps it."""
+        """Shift of the G-code origin in addition to that of G92 (SET_GCODE_OFFSET), mm; homing keeps it."""
         x, y, z, e = self._offset_mm
         return (x, y, z, e)
 
@@ -459,7 +459,7 @@ class Planner:
         self._offset_mm = list(offset)
 
     def shift_program(self, axis: str, distance_mm: float) -> None:
-        """Let the next move also make up for DISTANCE_MM along AXIS, without a move of its own."""
+        """Add DISTANCE_MM along AXIS to the next move, without a move of its own."""
         self._state.position[AXES.index(axis)] += distance_mm
 
     # ---- Arcs ----
@@ -495,9 +495,9 @@ class Planner:
         return FeedStatus(lib.gcode_arc_go_on(self._state, self._core))
 
     def suspend_program(self, *, moving: bool = True) -> SuspendedProgram:
-        """Let other lines come before the one at hand goes on; MOVING: they may move.
+        """Suspend the present line, so that other lines can be run; MOVING: they may move.
 
-        Then moves are made again where they are left out, until it goes on.
+        Then moves that are left out are made until the line resumes.
         """
         state = self._state
         arc = bytes(ffi.buffer(ffi.addressof(state, "arc")))
@@ -550,7 +550,7 @@ class Planner:
         return float(self._state.filament_top)
 
     def match_filament(self) -> None:
-        """Let the program go on from where the filament really is, wherever it believes it to be."""
+        """Set the program's filament position to the real one."""
         state = self._state
         shift = self._core.position[3] - state.position[3]
         state.position[3] += shift
@@ -558,7 +558,7 @@ class Planner:
         state.filament_top += shift
 
     def leave_out_from(self, place: Position) -> None:
-        """Leave out moves from here on; the program believes the head to be at PLACE, wherever it is."""
+        """Leave out moves from here on; the program's position becomes PLACE, wherever the head is."""
         self._state.position = place
         self.excluded = True
 
@@ -570,7 +570,7 @@ class Planner:
             self.excluded = False
 
     def leave_out(self, commands: Iterable[str]) -> None:
-        """Let the lines of COMMANDS, of those that ``feed`` acts on, be the caller's instead."""
+        """Leave the lines of COMMANDS, of those that ``feed`` acts on, to the caller."""
         self._state.left_out = 0
         for kind in {COMMAND_KINDS[command] for command in commands if command in COMMAND_KINDS}:
             self._state.left_out |= 1 << kind
@@ -609,11 +609,6 @@ class Planner:
     def moves_overflowed(self) -> int:
         """Moves planned before they were settled because the queue was full."""
         return int(self._core.moves_overflowed)
-
-    @property
-    def moves_queued(self) -> int:
-        """Moves that are not handed out yet."""
-        return int(self._core.tail - self._core.head)
 
 
 def ffi_memory(trapezoids: Any, count: int) -> Any:

@@ -7,7 +7,7 @@ static const double MIN_LENGTH = 1e-9;   // mm
 static const double POSITION_EPS = 1e-9; // mm by which sums of relative moves may miss a limit
 static const double MAX_EXTRUSION = 1e9; // mm; also keeps infinity and NaN out
 static const double MIN_SPEED = 1e-4;    // mm/s; keeps every duration finite
-static const double FASTEST = 1e9;       // mm/s; keeps what is told of any speed finite
+static const double FASTEST = 1e9;       // mm/s; keeps the reported figures of any speed finite
 // A move that extrudes no more than this length of path may hold is never refused: slicers round.
 static const double TINY_PATH = 0.1; // mm
 

@@ -9,7 +9,7 @@ static const double FLAT = 1e-9;
 static const double STRAIGHT_COS2 = 1e-16; // turn of 2e-8 rad
 static const double EVEN_FLOW = 1e-9;      // mm of filament per mm of path
 enum { PLAN_AFTER_MIN = 32 };
-// Whoever streams wants to know early what long moves are: what is added beyond plan_until cannot be paused.
+// A streamer has to know early what long moves are: what is added beyond plan_until cannot be paused.
 static const double PLAN_AFTER_S = 0.25;
 
 static inline struct planned_move *move_at(struct planner *p, uint64_t index) {

@@ -99,7 +99,7 @@ static int set_motor_position(struct step_gen *gen, const double *position) {
             s->origin = step_absolute(s, position) - (double)s->position;
     for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
         step_forget(s);
-    // Moves that still act are told as if they had led here.
+    // Moves that still act are shifted, as if they had led here.
     for (uint64_t i = gen->kept_from; i < gen->moves_to; i++)
         for (int j = 0; j < AXES; j++)
             gen->moves[i % STEP_TRAPEZOIDS].start[j] += shift[j];

@@ -41,7 +41,7 @@ static double evaluate(const struct stepper *s, const struct piece *p, double t,
     return u / s->config.step_distance - s->origin;
 }
 
-// Looks through a tap anew: the weighted sum of the axes that it shows, in steps.
+// Looks through a tap again: the weighted sum of the axes that it shows, in steps.
 static void look(const struct step_gen *gen, struct stepper *s, int index, unsigned axes) {
     const struct tap *tap = &gen->taps[index];
     struct seen *seen = &s->seen[index];
@@ -60,7 +60,7 @@ static void look(const struct step_gen *gen, struct stepper *s, int index, unsig
     }
 }
 
-// The place of a linear stepper: taps are looked through anew only where their phase is over.
+// The place of a linear stepper: taps are looked through again only where their phase is over.
 static double add_taps(const struct step_gen *gen, struct stepper *s, unsigned axes, struct piece *p) {
     double end = HUGE_VAL;
     for (int i = 0; i < gen->tap_count; i++) {

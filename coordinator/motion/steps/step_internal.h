@@ -99,18 +99,11 @@ struct clocks {
     uint32_t first, count, room;
 };
 
-struct timed {
-    uint64_t req, finish;
-    uint8_t size, payload[STEP_PAYLOAD_MAX];
-};
-
 struct node {
     struct step_node_config config;
     struct clock_map clock;
     struct clocks slots; // finish clocks of the commands that may still hold a slot
     struct clocks busy;  // those of them that are unfinished at the newest req_clock
-    struct timed *timed;
-    uint32_t timed_count;
     uint64_t last_req;
     uint8_t *out;
     size_t out_from, out_to;

@@ -106,14 +106,6 @@ static void emit_segment(struct node *node, struct stepper *s) {
     s->segment_count--;
 }
 
-static void emit_timed(struct node *node) {
-    const struct timed *first = &node->timed[0];
-    advance_req(node, first->req);
-    emit(node, take_slot(node, node->last_req, first->req, first->finish), first->payload, first->size);
-    node->timed_count--;
-    memmove(node->timed, node->timed + 1, node->timed_count * sizeof(*node->timed));
-}
-
 // ------------------------------------------------------------------------------------------------- merge
 
 static bool has_room(struct node *node) {
@@ -136,14 +128,12 @@ static size_t merge_node(struct step_gen *gen, struct node *node, bool flush) {
     struct stepper *mine[STEP_MAX_STEPPERS];
     size_t count = 0, moved = 0;
     int64_t steps_until = INT64_MAX;
-    int64_t timed_until = (int64_t)floor(clock_relative(&node->clock, gen->slice, 0));
     for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
         if (s->clock == &node->clock) {
             mine[count++] = s;
             const int64_t h = flush && !s->count ? INT64_MAX : horizon(gen, s);
             steps_until = h < steps_until ? h : steps_until;
         }
-    timed_until = steps_until < timed_until ? steps_until : timed_until;
     for (node->jammed = false;; moved++) {
         struct stepper *first = NULL;
         int64_t req = steps_until;
@@ -152,17 +142,13 @@ static size_t merge_node(struct step_gen *gen, struct node *node, bool flush) {
                 first = mine[i];
                 req = first->segments[first->segment_head].req;
             }
-        const bool timed = node->timed_count && node->timed[0].req <= positive(first ? req : timed_until);
-        if (!first && !timed)
+        if (!first)
             return moved;
         if (!has_room(node)) {
             node->jammed = true;
             return moved;
         }
-        if (timed)
-            emit_timed(node);
-        else
-            emit_segment(node, first);
+        emit_segment(node, first);
     }
 }
 
@@ -191,22 +177,4 @@ size_t step_take_batch(struct step_gen *gen, int index, uint8_t *out, size_t roo
     if (node->out_from == node->out_to)
         node->out_from = node->out_to = 0;
     return taken;
-}
-
-int step_add_timed(struct step_gen *gen, int index, uint64_t req_clock, uint64_t finish_clock,
-                   const uint8_t *payload, size_t size) {
-    if (index < 0 || index >= gen->node_count || !size || size > STEP_PAYLOAD_MAX || req_clock > INT64_MAX ||
-        finish_clock > INT64_MAX)
-        return STEP_BAD_CONFIG;
-    struct node *node = &gen->nodes[index];
-    if (node->timed_count == STEP_TIMED)
-        return STEP_FULL;
-    uint32_t at = node->timed_count++;
-    for (; at && node->timed[at - 1].req > req_clock; at--)
-        node->timed[at] = node->timed[at - 1];
-    node->timed[at].req = req_clock;
-    node->timed[at].finish = finish_clock;
-    node->timed[at].size = (uint8_t)size;
-    memcpy(node->timed[at].payload, payload, size);
-    return STEP_OK;
 }

@@ -57,13 +57,12 @@ static void carve_stepper(struct arena *arena, struct stepper *s) {
 static void carve_node(struct arena *arena, struct node *node, size_t slots) {
     uint64_t *slot = piece(arena, slots, sizeof(uint64_t));
     uint64_t *busy = piece(arena, slots, sizeof(uint64_t));
-    struct timed *timed = piece(arena, STEP_TIMED, sizeof(struct timed));
     uint8_t *out = piece(arena, STEP_OUT_BYTES, 1);
     if (!node)
         return;
     node->slots = (struct clocks){.at = slot, .room = (uint32_t)slots};
     node->busy = (struct clocks){.at = busy, .room = (uint32_t)slots};
-    node->timed = timed, node->out = out;
+    node->out = out;
 }
 
 static struct step_gen *carve(struct arena *arena, const struct step_config *c) {

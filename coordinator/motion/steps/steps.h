@@ -31,9 +31,7 @@ enum {
     STEP_TRAPEZOIDS = 4096, // moves the generator holds
     STEP_BUFFER = 8192,     // steps of one stepper that wait for compression
     STEP_SEGMENTS = 8192,   // segments of one stepper that wait to be merged
-    STEP_TIMED = 1024,      // other timed commands of one node that wait to be merged
     STEP_OUT_BYTES = 1 << 18,
-    STEP_PAYLOAD_MAX = 59, // one command must fit into a block
     STEP_MOVE_COUNT_MAX = 65535,
     STEP_SNAP = 65536,
     STEP_PARAMS = 8,
@@ -183,11 +181,6 @@ double step_look_ahead(const struct step_gen *gen);
 
 // How long (s) after the last move's end steps may still come.
 double step_lag(const struct step_gen *gen);
-
-// Merges another command of at most STEP_PAYLOAD_MAX bytes into a node's stream. It takes a slot until
-// FINISH_CLOCK. Returns STEP_FULL when STEP_TIMED wait already; STEP_BAD_CONFIG on a bad node or size.
-int step_add_timed(struct step_gen *gen, int node, uint64_t req_clock, uint64_t finish_clock,
-                   const uint8_t *payload, size_t size);
 
 // Copies whole records of NODE's batch (nodes/link/batch.h) to OUT and removes them; returns their bytes.
 size_t step_take_batch(struct step_gen *gen, int node, uint8_t *out, size_t room);

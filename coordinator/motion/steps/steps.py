@@ -1,6 +1,5 @@
 """Step generation: planned moves in, one stream of timed commands per node out (the manual is steps.h)."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -87,21 +86,6 @@ class StepStats:
     nodes: tuple[NodeStats, ...]
 
 
-def resting_step(spec: StepperSpec, start: Position, position: Position) -> int:
-    """Return the steps a stepper that started at START has done when its axes rest at POSITION (mm).
-
-    This is the rule the generator follows: half a step rounds up, and 1/65536 of a step decides no tie.
-    """
-    begin, end = (_mix(spec, at) / spec.step_distance for at in (start, position))
-    snap = int(lib.STEP_SNAP)
-    return math.floor(round((end - begin) * snap) / snap + 0.5)
-
-
-def _mix(spec: StepperSpec, position: Position) -> float:
-    x, y, z, e = (weight * axis for weight, axis in zip(spec.weights, position, strict=True))
-    return x + y + z + e
-
-
 class StepGenerator:
     """Turns trapezoids into every node's queue_step stream; one thread at a time.
 
@@ -168,24 +152,6 @@ class StepGenerator:
         out = ffi.new("uint8_t[]", room)
         taken = lib.step_take_batch(self._gen, node, out, room)
         return bytes(ffi.buffer(out, taken))
-
-    def add_timed(self, node: int, req_clock: int, finish_clock: int, payload: bytes) -> None:
-        """Merge another timed command into NODE's stream; it holds a queue slot until FINISH_CLOCK.
-
-        PAYLOAD: the encoded command, 1..59 bytes. Raises StepError when too many wait.
-        """
-        self._check_node(node)
-        status = lib.step_add_timed(self._gen, node, req_clock, finish_clock, payload, len(payload))
-        if status == lib.STEP_FULL:
-            raise StepError(
-                f"node {self._nodes[node].name}: {lib.STEP_TIMED} timed commands wait already; "
-                "generate steps up to their time first"
-            )
-        if status:
-            raise StepError(
-                f"node {self._nodes[node].name}: a timed command of {len(payload)} bytes is refused; "
-                f"1 to {lib.STEP_PAYLOAD_MAX} bytes are possible"
-            )
 
     @property
     def generated_until(self) -> float:
@@ -292,7 +258,7 @@ class StepGenerator:
         self._check_settled(status, f"the shaper of axis {axis}", f"impulses {list(impulses)}")
 
     def set_weights(self, stepper: int, weights: Position) -> None:
-        """Let STEPPER, which has no formula, follow other axes from now on.
+        """Make STEPPER, which has no formula, follow other axes from now on.
 
         Raises StepError unless all has settled.
         """

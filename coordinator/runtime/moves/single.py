@@ -23,7 +23,7 @@ SEND_AHEAD_S: Final = 0.6
 """Steps are made so far ahead of now: a busy host may pause that long, and what is left over is dropped."""
 CYCLE_S: Final = 0.05
 SETTLE_S: Final = 0.05
-"""After the last step is due, before it is believed to be done."""
+"""After the last step is due, before it counts as done."""
 BATCH_ROOM: Final = 1 << 16
 AXES: Final = ("x", "y", "z")
 

@@ -154,7 +154,7 @@ class Programs:
         ):
             self._pauses.resumed()
         if self._stats is not None:
-            self._stats.told = self._figures(job)
+            self._stats.job = self._figures(job)
         if self._card is not None:
             self._card.place = {
                 "file_position": job.done_bytes,

@@ -15,7 +15,7 @@ from coordinator.modules.module_set import build_modules
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
-from coordinator.runtime.machine import MachineModules
+from coordinator.runtime.machine import Modules
 from coordinator.streaming.program_machine import machine_state
 from nodes.support.errors import CanductorError
 
@@ -78,7 +78,7 @@ def _drain(planner: Planner) -> float:
     return high_mm
 
 
-def _variables(modules: "MachineModules") -> Mapping[str, Mapping[str, Any]]:
+def _variables(modules: "Modules") -> Mapping[str, Mapping[str, Any]]:
     return {macro.name: dict(macro.variables) for macro in modules.of(GCodeMacro)}
 
 

@@ -18,7 +18,7 @@ from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
-from coordinator.runtime.machine import MachineModules
+from coordinator.runtime.machine import Modules
 from coordinator.service.core.feeder import COME_BACK_MM_S
 from coordinator.service.core.interface import ServiceInterface
 from coordinator.service.core.motion import Motion
@@ -225,7 +225,7 @@ class Recovery:
                 " is no file to go on with; have them sent again",
             )
         if service.active_job is not None:
-            raise ApiError("busy", "a job is on its way; wait for its end, or cancel it")
+            raise ApiError("busy", "a job is active; wait for its end, or cancel it")
         if how.line is not None and how.line > found.line:
             raise ApiError(
                 "bad_params", f"{found.file} was interrupted at line {found.line}, before {how.line}"
@@ -286,7 +286,7 @@ class Recovery:
         return RecoverWork(program, line=line, reached=reached, held=found.held, objects=objects)
 
 
-def _hot(modules: "MachineModules") -> Mapping[str, Any]:
+def _hot(modules: "Modules") -> Mapping[str, Any]:
     """Return heater targets, fan speeds and excluded objects, as the modules report them."""
     status = modules.status()
     heaters: dict[str, float] = {}

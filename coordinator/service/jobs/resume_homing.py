@@ -13,7 +13,7 @@ from coordinator.gcode.builtins.machine import come_to_standstill
 from coordinator.gcode.events import Done, Event, Full
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.homing.homing import Homing
-from coordinator.runtime.machine import MachineModules
+from coordinator.runtime.machine import Modules
 from coordinator.service.core.work import LinesWork, Setting
 
 LIFT_MM: Final = 5.0
@@ -37,7 +37,7 @@ class ResumeHomingPlan:
 
 def plan_resume_homing(
     described: "MachineDescription",
-    modules: "MachineModules",
+    modules: "Modules",
     homed: str,
     *,
     part_mm: float,

@@ -237,7 +237,7 @@ def test_an_option_that_is_misspelt_makes_no_others_useless(tmp_path: Path) -> N
     (told,) = mistakes(tmp_path, text=GOOD + EXTRUDER)
     assert told.endswith(": [extruder] has no option 'heater_pinn'; did you mean 'heater_pin'?")
     useless = mistakes(tmp_path, text=GOOD + EXTRUDER.replace("heater_pinn", "colour"))
-    assert sum("has no effect beside the others" in line for line in useless) == 5
+    assert sum("has no effect with the others" in line for line in useless) == 5
 
 
 @pytest.mark.parametrize("rename", ["rename_existin: G28.1", "rename_existing: G-28"])

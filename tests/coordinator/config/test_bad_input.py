@@ -148,7 +148,7 @@ CASES = {
     ),
     "baud on a bus": (
         changed("11aa22bb33cc\n", "11aa22bb33cc\nbaud: 250000\n"),
-        "printer.cfg:3: option 'baud' of [mcu] has no effect beside the others; remove it",
+        "printer.cfg:3: option 'baud' of [mcu] has no effect with the others; remove it",
     ),
     "reset line on a bus": (
         changed("11aa22bb33cc\n", "11aa22bb33cc\nrestart_method: arduino\n"),
@@ -259,10 +259,7 @@ CASES = {
     ),
     "two ways to limit zig-zag": (
         changed("max_accel: 5000\n", "max_accel: 5000\nmax_accel_to_decel: 1\nminimum_cruise_ratio: 0.5\n"),
-        (
-            "printer.cfg:11: option 'max_accel_to_decel' of [printer] has no effect beside the"
-            " others; remove it"
-        ),
+        ("printer.cfg:11: option 'max_accel_to_decel' of [printer] has no effect with the others; remove it"),
     ),
     "further steppers with a gap": (
         PRINTER_CFG + "[stepper_z2]\n",

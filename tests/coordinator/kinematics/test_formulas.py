@@ -11,7 +11,7 @@ from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpa
 from coordinator.kinematics.delta import Delta
 from coordinator.kinematics.deltesian import Deltesian
 from coordinator.kinematics.rotary_delta import RotaryDelta
-from tests.coordinator.kinematics.machines import MACHINES, ceiling, number, points
+from tests.coordinator.kinematics.machines import MACHINES, number, points
 
 EVERY = pytest.mark.parametrize("name", MACHINES)
 STEP = 1e-4
@@ -129,21 +129,6 @@ def test_no_endstop_is_overrun_in_the_work_space(name: str, data: st.DataObject)
     machine, point = machine_and_point(data, name)
     for position, end in zip(machine.inverse(point), endstops(machine), strict=False):
         assert position <= end + 1e-6
-
-
-@EVERY
-@given(data=st.data())
-def test_the_work_space_contains_its_points_and_no_others(name: str, data: st.DataObject) -> None:
-    machine, point = machine_and_point(data, name)
-    space = machine.work_space
-    assert space.contains(point)
-    x, y, _ = point
-    high = (*space.high[:2], ceiling(space, x, y))
-    for axis in range(3):
-        for bound, away in ((space.low, -1e-3), (high, 1e-3)):
-            outside = list(point)
-            outside[axis] = bound[axis] + away
-            assert not space.contains((outside[0], outside[1], outside[2]))
 
 
 @TOWERS

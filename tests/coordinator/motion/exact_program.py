@@ -63,7 +63,7 @@ def plan_program(
     TABLES by axis correct it; with STAGE, corrections may act even without any.
     """
     description = load_machine(str(config))
-    devices = MachineDevices(description, build_modules(description))
+    devices = MachineDevices(description, build_modules(description).configure)
     first = description.nodes[0].name
     dictionaries = {
         node.name: firmware_dictionary(MAINBOARD if node.name == first else TOOLHEAD)

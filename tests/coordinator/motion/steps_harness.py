@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
-from coordinator.motion.steps.steps import StepGenerator, resting_step
+from coordinator.motion.steps.steps import StepGenerator
 from tests.coordinator.motion.steps_oracle import Move, Node, Position, Step, step_times
+from tests.stages.resting_step import resting_step
 
 ORIGIN: Position = (0.0, 0.0, 0.0, 0.0)
 MAX_ERROR_S = 12.5e-6

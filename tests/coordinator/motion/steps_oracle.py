@@ -204,16 +204,11 @@ class Node:
         self.invert = {s.oid: s.invert_dir for s in steppers}
         self.motors = {s.oid: Motor() for s in steppers}
         self.records: list[Record] = []
-        self.other: list[tuple[int, int, bytes]] = []
 
     def execute(self, batch: bytes) -> None:
         for min_clock, req_clock, payload in unpack(batch):
             values = read_values(payload)
-            name = self.names.get(values[0])
-            if name is None:
-                self.other.append((min_clock, req_clock, payload))
-                self.records.append(Record(min_clock, req_clock, "other", -1, values, size=len(payload)))
-                continue
+            name = self.names[values[0]]
             record = Record(min_clock, req_clock, name, values[1], values[2:], size=len(payload))
             getattr(self, f"_{name}")(record, self.motors[record.oid])
             self.records.append(record)

@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.kinematics.delta import USUAL_TOWER_SPEED, Delta, Tower
+from coordinator.kinematics.delta import Delta, Tower
 from coordinator.motion.planner.planner import Planner
 from tests.coordinator.motion.planner_helpers import LIMITS, flushed, joined
 
+USUAL_TOWER_SPEED = 3.0
+"""How much faster than the head a carriage may be (planner_move.c)."""
 ROD, RADIUS = 207.0, 100.0
 DELTA = Delta(
     (

@@ -75,14 +75,13 @@ static void what_there_is_not_is_refused(void) {
     struct step_gen *gen = begin();
     const double one = 1, two[] = {0.5, 0.6}, times[] = {-0.01, 0.01}, late = 0.01;
     struct step_correction correction;
-    uint8_t out[STEP_PAYLOAD_MAX + 1] = {0};
+    uint8_t out[60] = {0};
     for (int at = -1; at <= 2; at += 3) {
         CHECK_EQUAL(step_set_clock_base(gen, at, 0, 0, 168e6), STEP_BAD_CLOCK);
         CHECK_EQUAL(step_set_clock(gen, at, 168e6), STEP_BAD_CLOCK);
         CHECK_EQUAL(step_set_weights(gen, at, zeros), STEP_BAD_CONFIG);
         CHECK_EQUAL(step_set_smooth_time(gen, at, 0.02), STEP_BAD_CONFIG);
         CHECK_EQUAL(step_take_batch(gen, at, out, sizeof(out)), 0);
-        CHECK_EQUAL(step_add_timed(gen, at, 0, 0, out, 1), STEP_BAD_CONFIG);
     }
     CHECK_EQUAL(step_set_weights(gen, 1, zeros), STEP_BAD_CONFIG); // a winch has none
     for (int axis = -1; axis <= 3; axis += 4) {
@@ -101,20 +100,6 @@ static void what_there_is_not_is_refused(void) {
     CHECK_EQUAL(step_set_table(gen, 0, 3, falling, even, even, 1), STEP_BAD_CONFIG);
     CHECK_EQUAL(step_set_table(gen, 0, 3, rising, even, even, 0), STEP_BAD_CONFIG);
     check_it_still_works(gen);
-}
-
-static void timed_commands_have_bounds(void) {
-    struct step_gen *gen = begin();
-    uint8_t payload[STEP_PAYLOAD_MAX + 1] = {7};
-    CHECK_EQUAL(step_add_timed(gen, 0, 5, 5, payload, 0), STEP_BAD_CONFIG);
-    CHECK_EQUAL(step_add_timed(gen, 0, 5, 5, payload, sizeof(payload)), STEP_BAD_CONFIG);
-    CHECK_EQUAL(step_add_timed(gen, 0, UINT64_MAX, 5, payload, 1), STEP_BAD_CONFIG);
-    CHECK_EQUAL(step_add_timed(gen, 0, 5, UINT64_MAX, payload, 1), STEP_BAD_CONFIG);
-    for (unsigned i = 0; i < STEP_TIMED; i++)
-        CHECK_EQUAL(step_add_timed(gen, 0, 1000 - i, 1000, payload, STEP_PAYLOAD_MAX), STEP_OK);
-    CHECK_EQUAL(step_add_timed(gen, 0, 5, 5, payload, 1), STEP_FULL);
-    CHECK_EQUAL(step_add_timed(gen, 1, 5, 5, payload, 1), STEP_OK); // each node has its own
-    free(gen);
 }
 
 // While a move waits to be generated nothing may change that it was planned with.
@@ -153,7 +138,6 @@ static void an_error_stays(void) {
 int main(void) {
     bad_numbers_are_refused();
     what_there_is_not_is_refused();
-    timed_commands_have_bounds();
     nothing_changes_under_a_move();
     an_error_stays();
     return 0;

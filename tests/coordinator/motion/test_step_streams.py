@@ -118,25 +118,6 @@ def test_queue_slots_never_overflow(move_count: int) -> None:
     assert (stats.late_slots > 0) == (move_count < 4)
 
 
-def test_timed_commands_are_merged_by_their_clock() -> None:
-    moves = [make_move(1.0, ORIGIN, (5.0, 0.0, 0.0, 0.0), (0.0, 10.0, 0.0), 200.0)]
-    run = Run([stepper(0, X)], [node_spec()])
-    clocks = [int(168e6 * t) for t in (1.2, 1.1, 1.3)]
-    for clock in clocks:
-        run.gen.add_timed(0, clock, clock, bytes([77, clock % 50]))
-    run.play(moves)
-    run.check_nodes()
-    assert [(req, p) for _, req, p in run.nodes[0].other] == [
-        (clock, bytes([77, clock % 50])) for clock in sorted(clocks)
-    ]
-    with pytest.raises(StepError, match="60 bytes is refused"):
-        run.gen.add_timed(0, 1, 1, bytes(60))
-    for _ in range(1024):
-        run.gen.add_timed(0, 1 << 40, 1 << 40, b"x")
-    with pytest.raises(StepError, match="timed commands wait already"):
-        run.gen.add_timed(0, 1 << 40, 1 << 40, b"x")
-
-
 def test_small_batches_and_a_full_output_lose_nothing() -> None:
     moves, t = [], 1.0
     for i in range(4000):

@@ -304,7 +304,7 @@ def test_programs_have_files_printed_but_not_beside_a_job(fed: Fed) -> None:
     assert fed.output == ["File selected: b.gcode", "Not SD printing."]
     job = fed.job("G28", "SDCARD_PRINT_FILE FILENAME=c.gcode")
     fed.drive()
-    assert "a job is on its way" in str(job.error)
+    assert "a job is active" in str(job.error)
     assert len(fed.feeder.to_print) == 2
 
 
@@ -347,13 +347,13 @@ def test_the_card_and_its_file(fed: Fed) -> None:
     fed.lines("M23 a.gcode", "M26 S0", "M21", "SDCARD_RESET_FILE", "M24")
     fed.drive()
     assert fed.output == ["File selected: a.gcode", "SD card ok"]
-    assert "M24 comes before a file is chosen" in str(fed.feeder.finished[-1].error)
+    assert "M24 comes before a file is selected" in str(fed.feeder.finished[-1].error)
     fed.lines("M26 S100")
     fed.drive()
     assert "M26 cannot begin in the middle of a file: temperatures" in str(fed.feeder.finished[-1].error)
     fed.job("G28", "SDCARD_RESET_FILE")
     fed.drive()
-    assert "a job is on its way" in str(fed.feeder.finished[-1].error)
+    assert "a job is active" in str(fed.feeder.finished[-1].error)
 
 
 def test_layers_are_what_a_program_tells(fed: Fed) -> None:
@@ -389,11 +389,11 @@ def test_what_a_console_asks(fed: Fed) -> None:
     status, firmware, *command_help = fed.output
     assert status == "ready"
     assert firmware.startswith("FIRMWARE_NAME:canductor FIRMWARE_VERSION:")
-    assert "M24: Print the chosen file, or let the paused job go on" in command_help
+    assert "M24: Print the selected file, or resume the paused job" in command_help
     assert "G28: Home X, Y, Z, or all axes" in command_help
     assert not [line for line in command_help if line.startswith("_")]
     fed.job("STATUS")
     stats = next(fed.stage.modules.of(PrintStats))
-    stats.told = {"state": "printing", "filename": "job.gcode"}
+    stats.job = {"state": "printing", "filename": "job.gcode"}
     fed.drive()
     assert fed.output[-1] == "printing job.gcode"

@@ -2,9 +2,8 @@
 
 import math
 
-from coordinator.config.model import RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
-from coordinator.config.sections.bounds import MAX_POSITION
+from coordinator.config.sections.bounds import length_option
 from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
 from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, tidy
 from coordinator.config.sections.kinematics.towers import (
@@ -12,34 +11,24 @@ from coordinator.config.sections.kinematics.towers import (
     ROUND_RANGE_OPTIONS,
     check_directions,
     check_height,
+    of_first,
 )
-from coordinator.config.sections.rails import read_extra_steppers
+from coordinator.config.sections.rails import read_tower
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import MOTOR, read_stepper
+from coordinator.config.sections.steppers import MOTOR
 from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.delta import MAX_TOWER_SPEED, Delta, Tower
 
-DELTA_RADIUS = FloatOption(
-    name="delta_radius",
-    help="from a tower's joint to the head's, measured level, with the head in the middle",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+DELTA_RADIUS = length_option(
+    "delta_radius", "from a tower's joint to the head's, measured level, with the head in the middle"
 )
-PRINT_RADIUS = FloatOption(
-    name="print_radius",
-    help="how far from the middle the head may be; by default delta_radius, or less where rods lie too flat",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+PRINT_RADIUS = length_option(
+    "print_radius",
+    "how far from the middle the head may be; by default delta_radius, or less where rods lie too flat",
 )
-PRINTER = SectionSpec(help="What a delta needs besides", options=(DELTA_RADIUS, PRINT_RADIUS, MINIMUM_Z))
-ARM_LENGTH = FloatOption(
-    name="arm_length",
-    help="length of the rods, from joint to joint; by default that of stepper_a",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+PRINTER = SectionSpec(help="Further options of a delta", options=(DELTA_RADIUS, PRINT_RADIUS, MINIMUM_Z))
+ARM_LENGTH = length_option(
+    "arm_length", "length of the rods, from joint to joint; by default that of stepper_a"
 )
 ANGLE = FloatOption(
     name="angle",
@@ -74,23 +63,13 @@ def read_delta(reading: Reading, printer: SectionReader) -> Frame:
     rails = []
     for reader, tower, function in zip(readers, delta.towers, delta.step_functions(), strict=True):
         homing = read_tower_homing(reader, tower.endstop_height, reading.pins)
-        steppers = (
-            read_stepper(reader, function, reading.pins),
-            *read_extra_steppers(reading, reader.name, function),
-        )
-        reading.finish(reader)
-        rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
+        rails.append(read_tower(reading, reader, reader.name[-1], function, homing))
     home = tidy(delta.forward(delta.endstop_positions))
     return Frame(delta, tuple(rails), home, range_options=ROUND_RANGE_OPTIONS)
 
 
 def _read_tower(reader: SectionReader, first: SectionReader, angle: float, radius: float) -> Tower:
-    rod = reader.find(ARM_LENGTH)
-    if rod is None:
-        rod = first.get(ARM_LENGTH)
-    height = reader.find(POSITION_ENDSTOP)
-    if height is None:
-        height = first.get(POSITION_ENDSTOP)
+    rod, height = (of_first(reader, first, option) for option in (ARM_LENGTH, POSITION_ENDSTOP))
     given = reader.find(ANGLE)
     if rod <= radius:
         raise reader.bad(ARM_LENGTH, f"must be above delta_radius ({radius:g} mm): the rods would not reach")

@@ -2,15 +2,14 @@
 
 import math
 
-from coordinator.config.model import RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
-from coordinator.config.sections.bounds import MAX_POSITION
+from coordinator.config.sections.bounds import length_option
 from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
 from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, axis_range, home_of, tidy
-from coordinator.config.sections.kinematics.towers import MINIMUM_Z, check_height
-from coordinator.config.sections.rails import read_extra_steppers, read_rail
+from coordinator.config.sections.kinematics.towers import MINIMUM_Z, check_height, of_first
+from coordinator.config.sections.rails import read_rail, read_tower
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import MOTOR, read_stepper
+from coordinator.config.sections.steppers import MOTOR
 from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.base import linear
 from coordinator.kinematics.deltesian import Arm, Deltesian
@@ -24,31 +23,18 @@ MIN_ANGLE = FloatOption(
     above=0,
     below=90,
 )
-PRINT_WIDTH = FloatOption(
-    name="print_width",
-    help="range of X, centred; by default what min_angle allows",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
-)
+PRINT_WIDTH = length_option("print_width", "range of X, centred; by default what min_angle allows")
 PRINTER = SectionSpec(
-    help="What a deltesian needs besides",
+    help="Further options of a deltesian",
     options=(MINIMUM_Z, MIN_ANGLE, PRINT_WIDTH),
     unsupported=("slow_ratio",),
 )
-ARM_LENGTH = FloatOption(
-    name="arm_length",
-    help="length of the rod, from joint to joint; by default that of stepper_left",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+ARM_LENGTH = length_option(
+    "arm_length", "length of the rod, from joint to joint; by default that of stepper_left"
 )
-ARM_X_LENGTH = FloatOption(
-    name="arm_x_length",
-    help="level distance between tower and head with the head in the middle; by default that of stepper_left",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+ARM_X_LENGTH = length_option(
+    "arm_x_length",
+    "level distance between tower and head with the head in the middle; by default that of stepper_left",
 )
 SIDE = SectionSpec(
     help="A tower of a deltesian. position_endstop is Z of the head in the middle when the endstop switches;"
@@ -79,19 +65,14 @@ def read_deltesian(reading: Reading, printer: SectionReader) -> Frame:
     rails = []
     for reader, arm, function in zip(readers, (left, right), deltesian.step_functions()[:2], strict=True):
         homing = read_tower_homing(reader, arm.endstop_height, reading.pins)
-        first = read_stepper(reader, function, reading.pins)
-        steppers = (first, *read_extra_steppers(reading, reader.name, function))
-        reading.finish(reader)
-        name = reader.name.removeprefix("stepper_")
-        rails.append(RailDescription(name, steppers, None, None, homing, reader.place))
+        rails.append(read_tower(reading, reader, reader.name.removeprefix("stepper_"), function, homing))
     home = deltesian.forward((*deltesian.endstop_positions, home_of(y)))
     return Frame(deltesian, (*rails, y), tidy(home), range_options=RANGE_OPTIONS)
 
 
 def _read_side(reader: SectionReader, first: SectionReader, sign: float) -> Arm:
     rod, x, height = (
-        first.get(option) if (own := reader.find(option)) is None else own
-        for option in (ARM_LENGTH, ARM_X_LENGTH, POSITION_ENDSTOP)
+        of_first(reader, first, option) for option in (ARM_LENGTH, ARM_X_LENGTH, POSITION_ENDSTOP)
     )
     if rod <= x:
         raise reader.bad(ARM_LENGTH, f"must be above arm_x_length ({x:g} mm): the rod would not reach")

@@ -1,4 +1,4 @@
-"""[dual_carriage]: a second carriage on X or Y, beside the first."""
+"""[dual_carriage]: a second carriage on X or Y."""
 
 from collections.abc import Sequence
 from dataclasses import replace

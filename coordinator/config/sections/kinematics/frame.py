@@ -36,9 +36,9 @@ class KinematicsKind:
 
     kinematics: type[Kinematics]
     read: Callable[[Reading, SectionReader], Frame]
-    """Reads the sections and what [printer] says besides; raises ConfigError."""
+    """Reads the sections and its options in [printer]; raises ConfigError."""
     printer: SectionSpec | None = None
-    """What [printer] may contain besides."""
+    """Its options in [printer]."""
     steppers: tuple[str, ...] = ()
     """Sections [stepper_NAME] that it has, but for those of one letter."""
     reference: Mapping[str, SectionSpec] = field(default_factory=dict)

@@ -18,7 +18,7 @@ from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.base import StepFunction
 from coordinator.kinematics.generic_cartesian import GenericCartesian
-from coordinator.support.quoting import nearest, shown
+from coordinator.support.quoting import nearest_or_all, shown
 
 AXIS = ChoiceOption(
     name="axis", help="the axis of the carriage; by default its name, if that is one", choices=("x", "y", "z")
@@ -30,7 +30,7 @@ CARRIAGE = SectionSpec(
 )
 PRIMARY_CARRIAGE = TextOption(
     name="primary_carriage",
-    help="the [carriage NAME] beside which it runs",
+    help="the [carriage NAME] on whose axis it runs",
     pattern=r"\S+",
     pattern_rule="the name of a carriage",
 )
@@ -117,7 +117,7 @@ class _Carriages:
         if name in self.extra:
             return self.extra[name]
         names = (*self.first, *self.second, *self.extra)
-        hint = nearest(name, names) or f"; there is {', '.join(names)}"
+        hint = nearest_or_all(name, names)
         raise reader.bad(option, f"but there is no carriage {shown(name)}{hint}")
 
 

@@ -1,18 +1,17 @@
 """A polar machine: the turning bed [stepper_bed], the arm [stepper_arm], and [stepper_z]."""
 
-from coordinator.config.model import NO_ENDSTOP, RailDescription
+from coordinator.config.model import NO_ENDSTOP
 from coordinator.config.options import SectionReader, SectionSpec
-from coordinator.config.sections.homing import WAITING
 from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, axis_range, home_of
-from coordinator.config.sections.rails import POSITION_MAX, read_extra_steppers, read_rail
+from coordinator.config.sections.rails import POSITION_MAX, read_rail, read_tower
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import TURNING_MOTOR, read_stepper
+from coordinator.config.sections.steppers import TURNING_MOTOR
 from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.polar import Polar
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
 PRINTER = SectionSpec(
-    help="What a polar machine may have besides", options=(), unsupported=("max_angular_velocity",)
+    help="Further options of a polar machine", options=(), unsupported=("max_angular_velocity",)
 )
 BED = SectionSpec(
     help="The motor that turns the bed of a polar machine",
@@ -27,10 +26,7 @@ def read_polar(reading: Reading, _printer: SectionReader) -> Frame:
     """Return the frame of a polar machine; raises ConfigError."""
     turn, radius, up = Polar((0.0, 1.0), (0.0, 1.0)).step_functions()
     section = reading.get("stepper_bed", "a polar machine has stepper_bed, stepper_arm and stepper_z")
-    reader = SectionReader(section, BED)
-    motors = (read_stepper(reader, turn, reading.pins), *read_extra_steppers(reading, reader.name, turn))
-    reading.finish(reader, waiting=WAITING)
-    bed = RailDescription("bed", motors, None, None, NO_ENDSTOP, reader.place)
+    bed = read_tower(reading, SectionReader(section, BED), "bed", turn, NO_ENDSTOP)
     arm, z = read_rail(reading, "arm", radius), read_rail(reading, "z", up)
     low, high = axis_range(arm)
     if high <= 0:

@@ -35,7 +35,7 @@ KINDS = {
     )
 }
 PRINTER_SPECS = {name: kind.printer for name, kind in KINDS.items() if kind.printer is not None}
-"""What [printer] may contain besides, by kinematics."""
+"""Further options of [printer], by kinematics."""
 
 
 def read_frame(reading: Reading, kinematics: str, printer: SectionReader) -> Frame:

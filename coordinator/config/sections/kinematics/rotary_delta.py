@@ -2,61 +2,41 @@
 
 import math
 
-from coordinator.config.model import RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
-from coordinator.config.sections.bounds import MAX_POSITION
-from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, WAITING, read_tower_homing
+from coordinator.config.sections.bounds import length_option
+from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
 from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, tidy
 from coordinator.config.sections.kinematics.towers import (
     MINIMUM_Z,
     ROUND_RANGE_OPTIONS,
     check_directions,
     check_height,
+    of_first,
 )
-from coordinator.config.sections.rails import read_extra_steppers
+from coordinator.config.sections.rails import read_tower
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import TURNING_MOTOR, read_stepper
+from coordinator.config.sections.steppers import TURNING_MOTOR
 from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.rotary_delta import Arm, RotaryDelta
 
-SHOULDER_RADIUS = FloatOption(
-    name="shoulder_radius",
-    help="radius of the shoulders' circle less that of the joints at the head",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+SHOULDER_RADIUS = length_option(
+    "shoulder_radius", "radius of the shoulders' circle less that of the joints at the head"
 )
-SHOULDER_HEIGHT = FloatOption(
-    name="shoulder_height",
-    help="height of the shoulders above the bed less that of the head's joints above the nozzle",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+SHOULDER_HEIGHT = length_option(
+    "shoulder_height", "height of the shoulders above the bed less that of the head's joints above the nozzle"
 )
-PRINT_RADIUS = FloatOption(
-    name="print_radius",
-    help="how far from the middle the head may be; by default what gives the largest cylinder",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+PRINT_RADIUS = length_option(
+    "print_radius", "how far from the middle the head may be; by default what gives the largest cylinder"
 )
 PRINTER = SectionSpec(
-    help="What a rotary delta needs besides",
+    help="Further options of a rotary delta",
     options=(SHOULDER_RADIUS, SHOULDER_HEIGHT, PRINT_RADIUS, MINIMUM_Z),
 )
-UPPER_LENGTH = FloatOption(
-    name="upper_arm_length",
-    help="length of the upper arm, from shoulder to elbow; by default that of stepper_a",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+UPPER_LENGTH = length_option(
+    "upper_arm_length", "length of the upper arm, from shoulder to elbow; by default that of stepper_a"
 )
-LOWER_LENGTH = FloatOption(
-    name="lower_arm_length",
-    help="length of the lower arm, from elbow to head; by default that of stepper_a",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
+LOWER_LENGTH = length_option(
+    "lower_arm_length", "length of the lower arm, from elbow to head; by default that of stepper_a"
 )
 ANGLE = FloatOption(
     name="angle",
@@ -83,8 +63,7 @@ def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
     arms, ends = [], []
     for reader, default in zip(readers, _ANGLES, strict=True):
         arms.append(_read_arm(reader, readers[0], default))
-        end = reader.find(POSITION_ENDSTOP)
-        ends.append(readers[0].get(POSITION_ENDSTOP) if end is None else end)
+        ends.append(of_first(reader, readers[0], POSITION_ENDSTOP))
     check_directions(readers, ANGLE, tuple(arm.angle for arm in arms))
     machine = RotaryDelta(
         (arms[0], arms[1], arms[2]), radius, height, (ends[0], ends[1], ends[2]), min_z, print_radius
@@ -93,19 +72,13 @@ def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
     rails = []
     for reader, end, function in zip(readers, ends, machine.step_functions(), strict=True):
         homing = read_tower_homing(reader, end, reading.pins)
-        first = read_stepper(reader, function, reading.pins)
-        steppers = (first, *read_extra_steppers(reading, reader.name, function))
-        reading.finish(reader, waiting=WAITING if homing.waits else ())
-        rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
+        rails.append(read_tower(reading, reader, reader.name[-1], function, homing))
     home = tidy(machine.forward(machine.endstop_positions))
     return Frame(machine, tuple(rails), home, range_options=ROUND_RANGE_OPTIONS)
 
 
 def _read_arm(reader: SectionReader, first: SectionReader, angle: float) -> Arm:
-    upper, lower = (
-        first.get(option) if (own := reader.find(option)) is None else own
-        for option in (UPPER_LENGTH, LOWER_LENGTH)
-    )
+    upper, lower = (of_first(reader, first, option) for option in (UPPER_LENGTH, LOWER_LENGTH))
     given = reader.find(ANGLE)
     return Arm(upper, lower, math.radians(angle if given is None else given))
 

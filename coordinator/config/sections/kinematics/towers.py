@@ -1,18 +1,12 @@
 """What kinematics with towers or arms around the bed share: options and checks."""
 
 import math
+from typing import TypeVar
 
-from coordinator.config.options import FloatOption, SectionReader
-from coordinator.config.sections.bounds import MAX_POSITION
+from coordinator.config.options import FloatOption, Option, SectionReader
+from coordinator.config.sections.bounds import position_option
 
-MINIMUM_Z = FloatOption(
-    name="minimum_z_position",
-    help="lowest Z that the head may go to",
-    default=0.0,
-    unit="mm",
-    minimum=-MAX_POSITION,
-    maximum=MAX_POSITION,
-)
+MINIMUM_Z = position_option("minimum_z_position", "lowest Z that the head may go to", 0.0)
 ROUND_RANGE_OPTIONS = (
     "print_radius of [printer]",
     "print_radius of [printer]",
@@ -20,6 +14,15 @@ ROUND_RANGE_OPTIONS = (
 )
 """What says how far X, Y and Z may go where carriages or arms stand around the bed."""
 _TOO_CLOSE_DEG = 30.0
+
+
+T = TypeVar("T")
+
+
+def of_first(reader: SectionReader, first: SectionReader, option: Option[T]) -> T:
+    """Return an option of a tower or an arm, where it is absent that of the FIRST one; raises ConfigError."""
+    own = reader.find(option)
+    return first.get(option) if own is None else own
 
 
 def check_directions(

@@ -3,27 +3,20 @@
 import math
 import string
 
-from coordinator.config.model import NO_ENDSTOP, RailDescription
-from coordinator.config.options import FloatOption, SectionReader, SectionSpec
-from coordinator.config.sections.bounds import MAX_POSITION
-from coordinator.config.sections.homing import WAITING
+from coordinator.config.model import NO_ENDSTOP
+from coordinator.config.options import SectionReader, SectionSpec
+from coordinator.config.sections.bounds import position_option
 from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind
-from coordinator.config.sections.rails import read_extra_steppers
+from coordinator.config.sections.rails import read_tower
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import MOTOR, read_stepper
+from coordinator.config.sections.steppers import MOTOR
 from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.base import Point
 from coordinator.kinematics.geometry import cross, dot, subtract
 from coordinator.kinematics.winch import MIN_WINCHES, Winch
 
 ANCHORS = tuple(
-    FloatOption(
-        name=f"anchor_{axis}",
-        help=f"{axis.upper()} of the point where the cable comes from",
-        unit="mm",
-        minimum=-MAX_POSITION,
-        maximum=MAX_POSITION,
-    )
+    position_option(f"anchor_{axis}", f"{axis.upper()} of the point where the cable comes from")
     for axis in "xyz"
 )
 SPEC = SectionSpec(
@@ -54,12 +47,10 @@ def read_winch(reading: Reading, _printer: SectionReader) -> Frame:
     anchors = tuple(_read_anchor(reader) for reader in readers)
     _check_anchors(readers, anchors)
     winch = Winch(anchors)
-    rails = []
-    for reader, name, function in zip(readers, winch.rails, winch.step_functions(), strict=True):
-        first = read_stepper(reader, function, reading.pins)
-        steppers = (first, *read_extra_steppers(reading, reader.name, function))
-        reading.finish(reader, waiting=WAITING)
-        rails.append(RailDescription(name, steppers, None, None, NO_ENDSTOP, reader.place))
+    rails = (
+        read_tower(reading, reader, name, function, NO_ENDSTOP)
+        for reader, name, function in zip(readers, winch.rails, winch.step_functions(), strict=True)
+    )
     return Frame(winch, tuple(rails), (0.0, 0.0, 0.0), range_options=RANGE_OPTIONS)
 
 
@@ -80,7 +71,7 @@ def _check_anchors(readers: list[SectionReader], anchors: tuple[Point, ...]) -> 
     if math.sqrt(dot(normal, normal)) < _MIN_SINE * math.sqrt(dot(to_b, to_b) * dot(to_c, to_c)):
         raise readers[2].bad(
             ANCHORS[0],
-            "the anchors of stepper_a, stepper_b and stepper_c are on one line; place one beside it",
+            "the anchors of stepper_a, stepper_b and stepper_c are on one line; move one off it",
         )
 
 

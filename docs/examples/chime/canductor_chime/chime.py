@@ -1,17 +1,14 @@
 """[chime]: a bell or buzzer on a pin of any node, rung by the command CHIME at its place among the moves."""
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
+from coordinator.gcode.commands import Call, Reading, Synchronized
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import ModuleContext
 
 LENGTH_MAX_S: Final = 5.0
 PIN: Final = PinOption(name="pin", help="the bell's output; ! when low means ringing")
@@ -39,17 +36,12 @@ class Chime(Module):
         self._bell = DigitalOut(
             f"[{build.name}]", pin=pin.name, invert=pin.invert, max_duration_s=LENGTH_MAX_S + 1
         )
-        self._live: ModuleContext | None = None
         self._rung = 0
         build.add_device(self._node, self._bell)
-        build.add_command(GCodeCommand("CHIME", "Ring the bell for LENGTH seconds", self._read))
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
+        build.add_command("CHIME", "Ring the bell for LENGTH seconds", self._read)
 
     def status(self) -> dict[str, Value]:
-        """Tell how often it rang."""
+        """Report how often it rang."""
         return {"rung": self._rung}
 
     def _read(self, call: Call) -> Reading:
@@ -70,8 +62,7 @@ class Chime(Module):
 
     def _ring(self, print_time_s: float, length_s: float) -> None:
         """Ring from PRINT_TIME_S on; both edges are queued on the node, which makes them in time."""
-        live = self._live
-        assert live is not None, "commands are carried out on a machine that is connected"
+        live = self.live
         begin_s = live.soon(print_time_s)
         for at_s, on in ((begin_s, True), (begin_s + length_s, False)):
             self._bell.set(live.node(self._node), live.ticks_at(self._node, at_s), on)

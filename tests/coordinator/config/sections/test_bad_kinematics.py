@@ -123,7 +123,7 @@ BAD: dict[str, tuple[str, str, str, str]] = {
         "anchor_x: 4000\nanchor_y: 4000",
         (
             "option 'anchor_x' of [stepper_c] is '4000', the anchors of stepper_a, stepper_b and"
-            " stepper_c are on one line; place one beside it"
+            " stepper_c are on one line; move one off it"
         ),
     ),
     "one anchor twice": (

@@ -112,7 +112,7 @@ def test_options_become_registers(tmp_path: Path) -> None:
             "but there is no section [tmc2209 stepper_x]",
         ),
         ("tmc2209_stepper_x:virtual_endstop", "!tmc2209_stepper_x:virtual_endstop", "takes no marks"),
-        ("tmc2209_stepper_x:virtual_endstop", "tmc2208_stepper_z:virtual_endstop", "cannot feel the end"),
+        ("tmc2209_stepper_x:virtual_endstop", "tmc2208_stepper_z:virtual_endstop", "cannot detect the end"),
         ("run_current: 0.8\nhold", "run_current: 2.1\nhold", "must be a number in A, above 0 and at most 2"),
         ("hold_current: 0.5", "holdcurrent: 0.5", "did you mean 'hold_current'?"),
         ("uart_address: 1", "uart_address: 0", "have the same pins and uart_address 0; give each driver"),
@@ -130,7 +130,7 @@ def test_mistakes_are_told(tmp_path: Path, old: str, new: str, sentence: str) ->
 
 def test_two_drivers_of_one_stepper_are_refused(tmp_path: Path) -> None:
     (found,) = problems(tmp_path, ("[tmc2208 stepper_z]", "[tmc2208 stepper_x]"))
-    assert "are one stepper's; remove one" in found
+    assert "are for the same stepper; remove one" in found
 
 
 def test_a_further_side_of_an_axis_feels_by_its_own_driver(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def test_a_fan_whose_sensor_is_silent_runs_at_its_highest_speed(stage: HeatMachi
         assert stage.status(SIDE)["speed"] == 0.9
         await asyncio.sleep(5.0)
         (told,) = [text for text in stage.notices if "highest speed" in text]
-        assert told.startswith(f"[{SIDE}] runs at its highest speed: its sensor says nothing any more; check")
+        assert told.startswith(f"[{SIDE}] runs at its highest speed: its sensor is silent; check")
         await stage.do("SET_TEMPERATURE_FAN_TARGET TEMPERATURE_FAN=bed_side TARGET=0")
         await asyncio.sleep(2.0)
         assert stage.status(SIDE)["speed"] == 0

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.modules.heaters.heater import BAD_MEASUREMENTS
-from coordinator.modules.pinned import AHEAD_S
+from coordinator.modules.outputs.timing import AHEAD_S
 from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
 from coordinator.modules.sensors.temperature_source import BAD_IN_A_ROW
 from nodes.devices.analog_in import RANGE_CHECKS
@@ -119,7 +119,7 @@ def test_a_sensor_that_no_node_watches_stops_the_machine_by_bad_ones_in_a_row_on
         for _ in range(BAD_IN_A_ROW - 2):
             await source.next()
             assert stage.machine.stopped is None
-        with pytest.raises(CanductorError, match=r"\[temperature_sensor computer\] tells 140 °C"):
+        with pytest.raises(CanductorError, match=r"\[temperature_sensor computer\] reads 140 °C"):
             await source.next()
 
     stage.connected(main)

@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.heat.mpc import Mpc
 from coordinator.modules.heaters.heater import LOOK_S, STALE_SPARE_S
-from coordinator.modules.pinned import AHEAD_S
+from coordinator.modules.outputs.timing import AHEAD_S
 from nodes.support.errors import CanductorError
 from tests.coordinator.modules.heaters.broken_sensor import Sensor
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine
@@ -66,7 +66,7 @@ def test_the_host_stops_the_machine_when_the_nodes_net_fails(tmp_path: Path, cel
         measure(sensor, celsius)
         assert stage.machine.stopped is not None
         assert (
-            f"heater extruder: its sensor tells {celsius:.0f} °C, outside 0 to 300 °C;"
+            f"heater extruder: its sensor reads {celsius:.0f} °C, outside 0 to 300 °C;"
             " check the sensor and its wires"
         ) in await stage.stopped(1.0)
 
@@ -116,7 +116,7 @@ def test_a_silent_sensor_stops_the_machine_at_the_third_look(tmp_path: Path) -> 
         await sensor.unit.input.next()
         since_s = stage.now_s()
         sensor.silence()
-        assert "its sensor has not said anything for some 3 s; check node toolhead" in await stage.stopped()
+        assert "its sensor has been silent for about 3 s; check node toolhead" in await stage.stopped()
         assert 3 * LOOK_S - SLACK_S < stage.now_s() - since_s < 4 * LOOK_S + SLACK_S
 
     stage.connected(main)
@@ -133,10 +133,10 @@ def test_a_heater_whose_sensors_node_goes_away_forgets_all(tmp_path: Path) -> No
         unit = sensor.unit
         assert unit.power > 0
         await asyncio.sleep(0.2)  # half of what the last value was sent ahead
-        unit._let_go("node box is lost")
+        unit._switch_off("node box is lost")
         since_s = stage.now_s()
         assert (unit.target_c, unit.power, unit._on) == (0.0, 0.0, False)
-        with pytest.raises(CanductorError, match="heater chamber went off: node box is lost"):
+        with pytest.raises(CanductorError, match="heater chamber was turned off: node box is lost"):
             await unit._next()
         await asyncio.sleep(AHEAD_S + 0.05)
         off_s = stage.heater_off_after(since_s, "PC3", "mcu")
@@ -146,13 +146,13 @@ def test_a_heater_whose_sensors_node_goes_away_forgets_all(tmp_path: Path) -> No
         await sensor.good(4)
         assert unit.power == 0
         edges = len(stage.edges("PC3", "mcu"))
-        unit._let_go("again")  # no target, no power: there is nothing to say and nothing to switch
+        unit._switch_off("again")  # no target, no power: there is nothing to say and nothing to switch
         await asyncio.sleep(1.0)
         assert len(stage.edges("PC3", "mcu")) == edges
         assert [notice for notice in stage.notices if "was cleared" in notice] == [told]
         await stage.do("SET_HEATER_TEMPERATURE HEATER=chamber TARGET=0.5")
-        assert unit._gone is None
-        unit._let_go("a target below one degree is one, too")
+        assert unit._off_because is None
+        unit._switch_off("a target below one degree is one, too")
         assert len([notice for notice in stage.notices if "was cleared" in notice]) == 2
         assert stage.machine.stopped is None
 
@@ -170,7 +170,7 @@ def test_a_heater_that_is_off_is_not_looked_after(tmp_path: Path) -> None:
         stage.stage.cut("box")
         await asyncio.sleep(8.0)
         assert stage.machine.stopped is None
-        assert sensor.unit._gone is None
+        assert sensor.unit._off_because is None
 
     stage.connected(main)
 
@@ -243,11 +243,11 @@ def test_a_calibration_whose_node_went_away_heats_no_more(tmp_path: Path) -> Non
         sensor, trial = Sensor(stage), Trial(fails_at=1000)
         running = asyncio.ensure_future(sensor.unit.tune(trial))
         await sensor.good(3)
-        sensor.unit._let_go("node box is lost")
+        sensor.unit._switch_off("node box is lost")
         asked = trial.measurements
         measure(sensor, 25.0, 3)
         assert trial.measurements == asked
-        with pytest.raises(CanductorError, match="heater extruder went off: node box is lost"):
+        with pytest.raises(CanductorError, match="heater extruder was turned off: node box is lost"):
             await running
 
     stage.connected(main)

@@ -225,7 +225,7 @@ def test_three_silent_looks_are_allowed_and_the_fourth_stops(chamber: Driven) ->
     assert live.stops == []
     unit._look()
     assert live.stops == [
-        "heater chamber: its sensor has not said anything for some 3 s; check node mcu and its wires"
+        "heater chamber: its sensor has been silent for about 3 s; check node mcu and its wires"
     ]
 
 
@@ -253,7 +253,7 @@ def test_a_look_that_finds_a_node_away_forgets_the_target_and_ends_the_wait(tmp_
             unit._look()
         await turns()
         assert waiting.done()
-        with pytest.raises(CanductorError, match="heater chamber went off: node toolhead is lost"):
+        with pytest.raises(CanductorError, match="heater chamber was turned off: node toolhead is lost"):
             await waiting
         assert (unit.target_c, unit.power, driven.live.stops) == (0.0, 0.0, [])
         assert len(driven.sent) == 1

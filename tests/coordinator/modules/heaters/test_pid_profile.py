@@ -70,7 +70,7 @@ def test_a_profile_is_saved_and_there_at_the_next_start(tmp_path: Path) -> None:
     async def main() -> None:
         await stage.do("PID_PROFILE SET_VALUES=mine HEATER=extruder KP=25 KI=1.5 KD=99")
         await stage.do("PID_PROFILE SAVE=mine HEATER=extruder")
-        assert any("profile mine of extruder is there" in notice for notice in stage.notices)
+        assert any("profile mine of extruder was saved" in notice for notice in stage.notices)
         await stage.do("SAVE_CONFIG")
 
     stage.connected(main)

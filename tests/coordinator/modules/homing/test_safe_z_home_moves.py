@@ -280,5 +280,5 @@ def test_a_position_is_within_100_m(tmp_path: Path, value: str) -> None:
 
 
 def test_only_one_may_stand_in_for_g28(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="and another section both say what G28 does; remove one"):
+    with pytest.raises(ConfigError, match="and another section both replace G28; remove one"):
         load_machine(write(tmp_path, SWITCHES_CFG + OVERRIDE + SAFE))

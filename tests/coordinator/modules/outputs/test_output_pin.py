@@ -99,7 +99,7 @@ def test_static_outputs_are_switched_at_the_start(tmp_path: Path) -> None:
         (LAMP.replace("value: 1", "value: 0.5"), "option 'value' of .* is '0.5', which must be 0 or 1"),
         (SOFT.replace("value: 2.5", "value: 12"), "'value' of .* is '12', which must be 0 to 10"),
         (SOFT.replace("shutdown_value: 10", "shutdown_value: 5"), "'shutdown_value'.* needs hardware_pwm"),
-        (LAMP + "cycle_time: 1\n", "'cycle_time' of .* has no effect beside the others"),
+        (LAMP + "cycle_time: 1\n", "'cycle_time' of .* has no effect with the others"),
         (LAMP.replace("!PC5", "PA1"), "PA1.* 'step_pin' of \\[stepper_x\\]"),
         ("\n[static_digital_output x]\npins: PC5, ^PC6\n", "'pins' of .* which is an output; remove the"),
         (

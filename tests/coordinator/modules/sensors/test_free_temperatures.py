@@ -83,7 +83,7 @@ def test_a_host_that_is_too_hot_stops_the_machine(tmp_path: Path) -> None:
 
     async def main() -> None:
         (tmp_path / "temp").write_text("81000")
-        assert "tells 81 °C, outside its min_temp" in await stage.stopped(20)
+        assert "reads 81 °C, outside its min_temp" in await stage.stopped(20)
 
     stage.connected(main)
 
@@ -142,7 +142,7 @@ def test_a_combined_sensor_waits_for_all_of_them(tmp_path: Path) -> None:
     ("text", "wrong"),
     [
         (CHIP.replace("toolhead", "toolhaed"), "option 'sensor_mcu'.*no node 'toolhaed'; did you mean"),
-        (CHIP + "sensor_pin: PA7\n", "option 'sensor_pin'.*has no effect beside the others"),
+        (CHIP + "sensor_pin: PA7\n", "option 'sensor_pin'.*has no effect with the others"),
         (CHIP + "sensor_adc1: 0.2\n", "needs all of sensor_temperature1"),
         (BOTH.format(method="median"), "option 'combination_method'.*min, max"),
         (
@@ -155,7 +155,7 @@ def test_a_combined_sensor_waits_for_all_of_them(tmp_path: Path) -> None:
         ),
         (
             BED.replace("Generic 3950", "temperature_host"),
-            "no node can watch: a heater needs a sensor on a pin",
+            "no node can check: a heater needs a sensor on a pin",
         ),
         (BED + "sensor_path: /x\n", r"\[heater_bed\] has no option 'sensor_path'"),
     ],

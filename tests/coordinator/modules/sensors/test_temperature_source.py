@@ -68,7 +68,7 @@ def test_values_out_of_range_stop_the_machine_once_when_there_are_six_in_a_row(c
     source._watch(machine.live, celsius)
     (cause,) = machine.causes
     assert cause.startswith(
-        f"[chamber] tells {celsius:.0f} °C, outside its min_temp of 5 and max_temp of 80 °C"
+        f"[chamber] reads {celsius:.0f} °C, outside its min_temp of 5 and max_temp of 80 °C"
     )
     source._watch(machine.live, celsius)
     assert len(machine.causes) == 1
@@ -138,7 +138,7 @@ def test_a_sensor_that_is_silent_ends_the_wait_after_ten_seconds(node: str, hint
         began_s = loop.time()
         with pytest.raises(CanductorError) as error:
             await source.next()
-        assert str(error.value) == f"the sensor of [chamber] says nothing any more{hint}"
+        assert str(error.value) == f"the sensor of [chamber] is silent{hint}"
         assert loop.time() - began_s == pytest.approx(10.0)
 
     run(main)

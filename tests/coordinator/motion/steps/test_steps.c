@@ -4,6 +4,7 @@
 #include "coordinator/motion/steps/steps.h"
 #include "nodes/link/batch.h"
 #include "tests/check.h"
+#include "wire/wire.h"
 
 #include <math.h>
 #include <stdlib.h>
@@ -54,7 +55,7 @@ static size_t drain(struct step_gen *gen, size_t room) {
             struct batch_record record;
             for (size_t at = 0, whole; at < size; at += whole, records++) {
                 whole = batch_read(out + at, size - at, &record);
-                CHECK(whole && record.size && record.size < STEP_PAYLOAD_MAX);
+                CHECK(whole && record.size && record.size < WIRE_CONTENT_MAX);
             }
         }
     return records;

@@ -1,10 +1,10 @@
-"""Reads the parameters of modules' commands; every mistake is a WordError that says what to write."""
+"""Reads the parameters of commands; every mistake is a WordError that says what to write."""
 
 from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
 from coordinator.gcode.parser import Command, WordError, number, quoted
-from coordinator.support.quoting import nearest
+from coordinator.support.quoting import nearest_or_all
 
 T = TypeVar("T", float, None)
 
@@ -13,11 +13,6 @@ def numbers(command: Command, allowed: str) -> dict[str, float]:
     """Return COMMAND's letters of ALLOWED, all with numbers; others are ignored."""
     words = command.only_words(allowed)
     return {letter: number(command.name, words, letter) for letter in words}
-
-
-def parameters(command: Command, allowed: Iterable[str]) -> dict[str, str]:
-    """Return COMMAND's NAME=VALUE of ALLOWED; others are ignored."""
-    return command.only_parameters(allowed)
 
 
 def value(command: Command, given: Mapping[str, str], name: str, default: float | None = None) -> float:
@@ -34,11 +29,11 @@ def one(command: Command, given: Mapping[str, str], name: str, known: Iterable[s
     known = tuple(known)
     text = given.get(name)
     if text is None:
-        raise WordError(f"{command.name} needs {name}=; there is {', '.join(known)}")
+        raise WordError(f"{command.name} needs {name}=; there is {', '.join(known) or 'none'}")
     for name_ in known:
         if name_.lower() == text.lower():
             return name_
-    hint = nearest(text, known) or f"; there is {', '.join(known)}"
+    hint = nearest_or_all(text, known)
     raise WordError(f"{command.name}: there is no {quoted(text)}{hint}")
 
 
