@@ -73,9 +73,8 @@ def _queue(link: LinkFacts) -> Iterator[Finding]:
         yield warning(
             "txqueuelen-small",
             f"the send queue of {link.name} holds {length} frames (txqueuelen)",
-            "a burst of frames does not fit: programs get 'No buffer space available' (ENOBUFS), and some"
-            " lose"
-            " the frame",
+            "a burst of frames does not fit: programs get 'No buffer space available' (ENOBUFS), and some "
+            "lose the frame",
             fix,
         )
     elif length > QUEUE_MAX:
@@ -84,9 +83,8 @@ def _queue(link: LinkFacts) -> Iterator[Finding]:
         yield warning(
             "txqueuelen-large",
             f"the send queue of {link.name} holds {length} frames (txqueuelen)",
-            f"on a busy bus a frame may wait {wait_ms:,.0f} ms behind others, an emergency stop too; a long"
-            " queue"
-            " hides a bus that is too slow until commands come too late",
+            f"on a busy bus a frame may wait {wait_ms:,.0f} ms behind others, an emergency stop too; a long "
+            "queue hides a bus that is too slow until commands come too late",
             fix,
         )
 
@@ -161,14 +159,12 @@ CABLE: Final = (
 def _cause(tx: int, rx: int) -> str:
     if tx > rx:
         return (
-            "what it sends is not acknowledged: nobody else is on the bus, or all others run at another bit"
-            " rate,"
-            " have no power or are cut off"
+            "what it sends is not acknowledged: nobody else is on the bus, or all others run at another bit "
+            "rate, have no power or are cut off"
         )
     return (
-        "it hears frames that are damaged: a missing or surplus terminator, swapped wires, a loose crimp,"
-        " or nodes"
-        " at another bit rate"
+        "it hears frames that are damaged: a missing or surplus terminator, swapped wires, a loose crimp, or "
+        "nodes at another bit rate"
     )
 
 
@@ -184,9 +180,8 @@ def _history(link: LinkFacts) -> Iterator[Finding]:
         yield warning(
             "adapter-overruns",
             f"the adapter of {link.name} had no room for {link.rx_overruns} frames it received (overruns)",
-            "frames are lost in the adapter or its driver: the host is too slow in fetching them, often a"
-            " busy"
-            " USB hub or SPI",
+            "frames are lost in the adapter or its driver: the host is too slow in fetching them, often a "
+            "busy USB hub or SPI",
             "connect the adapter to a port of its own; 'ip -s link show "
             + link.name
             + "' shows whether it grows",
@@ -200,12 +195,10 @@ def _adapter(facts: InterfaceFacts) -> Iterator[Finding]:
         yield warning(
             "kernel-reorders",
             f"{facts.name} is driven by {fault.driver} of kernel {adapter.kernel}",
-            f"before {fixed} that driver {fault.what}; blocks arrive in pieces, hosts count bytes_invalid"
-            " and time"
-            f" out ({fault.source})",
-            f"update the kernel to {fixed} or newer (uname -r; sudo apt full-upgrade), or use a"
-            " distribution that"
-            " took the change over",
+            f"before {fixed} that driver {fault.what}; blocks arrive in pieces, hosts count bytes_invalid "
+            f"and time out ({fault.source})",
+            f"update the kernel to {fixed} or newer (uname -r; sudo apt full-upgrade), or use a "
+            "distribution that took the change over",
         )
 
 

@@ -51,12 +51,10 @@ def _nobody(facts: NodeFacts, place: BusAddress) -> Finding:
         "no-nodes",
         f"0 uuids found: no node answers on {place.name}{at}"
         + (f"; nothing heard at {tried} either" if tried else ""),
-        "the nodes have no power, are cut off, were built for another bit rate (CANBUS_FREQUENCY) or for"
-        " USB, or"
-        " run no firmware at all",
-        "check power, CANH and CANL, two terminators of 120 ohm (60 between the wires), and the bit rate in"
-        " the"
-        f" nodes' firmware settings; then ask again: 'canductor can query {place.words}'",
+        "the nodes have no power, are cut off, were built for another bit rate (CANBUS_FREQUENCY) or for "
+        "USB, or run no firmware at all",
+        "check power, CANH and CANL, two terminators of 120 ohm (60 between the wires), and the bit rate "
+        f"in the nodes' firmware settings; then ask again: 'canductor can query {place.words}'",
     )
 
 
@@ -66,9 +64,8 @@ def _twins(entries: tuple[InventoryEntry, ...]) -> Iterator[Finding]:
         yield problem(
             "duplicate-uuid",
             f"more than one board answers with the uuid {uuid}",
-            "their chips have the same serial number (cloned chips), or one wrote the other's: a host"
-            " cannot tell"
-            " them apart, and both would take one id",
+            "their chips have the same serial number (cloned chips), or one wrote the other's: a host "
+            "cannot tell them apart, and both would take one id",
             "take one of them off the bus, or build its firmware with a uuid of its own",
         )
 
@@ -85,9 +82,8 @@ def _shared_ids(facts: NodeFacts, entries: tuple[InventoryEntry, ...]) -> Iterat
             yield problem(
                 "duplicate-nodeid",
                 f"node id {nodeid} is used by more than one board: {', '.join(sorted(uuids))}",
-                "both act on every command and their answers collide; two hosts gave out ids, or a board"
-                " kept its"
-                " id when another host began",
+                "both act on every command and their answers collide; two hosts gave out ids, or a board "
+                "kept its id when another host began",
                 "stop all hosts but one, switch these boards off and on, and let that one host give out the"
                 " ids",
             )
@@ -163,12 +159,10 @@ def _ping(ping: PingFacts, place: BusAddress) -> Iterator[Finding]:
             f"of {ping.asked} questions to node {ping.nodeid}, {ping.lost} got lost with no trace, and"
             f" {ping.invalid_bytes} bytes of its answers were no valid block ({ping.repeats} blocks were"
             " repeated)",
-            "frames get lost between this program and the node. On the wire controllers repeat what was"
-            " damaged,"
-            " so it is the adapter, the kernel, or the node's receive buffer",
-            f"look at the counters: ip -details -statistics link show {place.name}; try another USB port,"
-            " cable or"
-            " adapter, and a kernel of 6.6 or newer",
+            "frames get lost between this program and the node. On the wire controllers repeat what was "
+            "damaged, so it is the adapter, the kernel, or the node's receive buffer",
+            f"look at the counters: ip -details -statistics link show {place.name}; try another USB port, "
+            "cable or adapter, and a kernel of 6.6 or newer",
         )
     if ping.rtt_p99_s > RTT_SPREAD_S:
         yield slow(ping.nodeid, ping.rtt_median_s, ping.rtt_p99_s, f"{ping.asked} questions")

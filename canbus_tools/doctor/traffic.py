@@ -42,9 +42,8 @@ def _load(facts: TrafficFacts, place: BusAddress) -> Iterator[Finding]:
     busiest = max(load.classes.items(), key=lambda item: item[1].bits)
     seen = f"the bus is {load.mean:.0%} busy, most of it by frames of the class '{busiest[0].value}'"
     do = (
-        f"see who sends so much: 'canductor can load {place.words} --watch'; a higher bit rate (all nodes"
-        " have to be"
-        " flashed for it), or a second bus for some of the nodes, makes room"
+        f"see who sends so much: 'canductor can load {place.words} --watch'; a higher bit rate (all nodes "
+        "have to be flashed for it), or a second bus for some of the nodes, makes room"
     )
     if load.mean >= LOAD_FULL:
         means = "frames with high ids hardly get through: what nodes and hosts say is late, up to time-outs"
@@ -66,9 +65,8 @@ def _errors(facts: TrafficFacts) -> Iterator[Finding]:
         yield problem(
             "nobody-acknowledges",
             f"{acks} error reports say that nobody acknowledged a frame",
-            "no other controller hears this one: it is alone, cut off, or all others run at another bit"
-            " rate or"
-            " have no power",
+            "no other controller hears this one: it is alone, cut off, or all others run at another bit "
+            "rate or have no power",
             "check power and plugs of the nodes, then the bit rate they were built for; " + CABLE,
         )
     damaged = sum(facts.errors.get(kind, 0) for kind in WIRE_ERRORS)
@@ -86,9 +84,8 @@ def _errors(facts: TrafficFacts) -> Iterator[Finding]:
             yield problem(
                 "only-damage",
                 f"{damaged} error reports of damaged frames ({kinds}) and not one good frame",
-                "somebody sends, and nothing of it can be read: most often the bit rate of this interface"
-                " is not"
-                " theirs, or H and L are swapped",
+                "somebody sends, and nothing of it can be read: most often the bit rate of this interface "
+                "is not theirs, or H and L are swapped",
                 "set the bit rate that the nodes were built for, or let 'canductor can doctor"
                 " --try-bitrates' find it",
             )
@@ -147,12 +144,10 @@ def _node(way: DirectionFacts, interface: InterfaceFacts | None) -> Iterator[Fin
     if way.to_blocks and way.repeated_blocks / way.to_blocks > REPEATS_MANY:
         yield warning(
             "bytes-retransmit",
-            f"{way.repeated_blocks} of {way.to_blocks} blocks to node {way.nodeid} were sent more than"
-            " once, and"
-            f" {way.naks} were refused (hosts count this as bytes_retransmit)",
-            "blocks or their acknowledgements get lost or come too late: an overloaded bus or host, or"
-            " frames lost"
-            " in the adapter",
+            f"{way.repeated_blocks} of {way.to_blocks} blocks to node {way.nodeid} were sent more than "
+            f"once, and {way.naks} were refused (hosts count this as bytes_retransmit)",
+            "blocks or their acknowledgements get lost or come too late: an overloaded bus or host, or "
+            "frames lost in the adapter",
             "see whether 'frames-dropped' or 'bus-overloaded' is reported here too; a few after a restart are"
             " normal",
         )
@@ -166,9 +161,8 @@ def slow(nodeid: int, median_s: float, p99_s: float, how: str) -> Finding:
         "round-trip-spread",
         f"node {nodeid} answers in {median_s * 1000:.1f} ms as a rule, but one answer in a hundred takes"
         f" {p99_s * 1000:.1f} ms or more (measured by {how})",
-        "commands sent shortly before they are due come too late, and the node's clock is known less well:"
-        " a busy"
-        " bus or host, a long send queue, or USB power saving",
+        "commands sent shortly before they are due come too late, and the node's clock is known less well: "
+        "a busy bus or host, a long send queue, or USB power saving",
         "compare under load and without: 'canductor can load'; turn power saving of the USB port off"
         " (echo on | sudo tee /sys/bus/usb/devices/*/power/control)",
     )

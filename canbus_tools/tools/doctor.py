@@ -139,10 +139,9 @@ def _try_by_hand(name: str) -> Finding:
         "bitrates-by-hand",
         "other bit rates were not tried",
         "the bit rate of a SocketCAN interface is the system's to change",
-        f"for 500000, 250000 and 1000000 in turn: sudo ip link set {name} down; sudo ip link set {name} up"
-        " type can"
-        f" bitrate 500000 listen-only on; then 'canductor can load -c {name}': at the right one there are"
-        " frames. At the end: listen-only off",
+        f"for 500000, 250000 and 1000000 in turn: sudo ip link set {name} down; sudo ip link set {name} up "
+        f"type can bitrate 500000 listen-only on; then 'canductor can load -c {name}': at the right one "
+        "there are frames. At the end: listen-only off",
     )
 
 
