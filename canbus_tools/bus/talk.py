@@ -9,17 +9,19 @@ with long pauses: what goes to a node with a low id would go before the host's m
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from typing import Any, Final, Protocol
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from typing import Any, Final, Protocol, TypeVar
 
 from canbus_tools.bus.computer import Computer, Port
 from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.protocol.protocol import Direction, data_id, owner_of
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
 from nodes.dictionary.parts import DictionaryError
 from nodes.link import Frame, LinkIO, LinkSettings, LinkStats, Response
 from nodes.link.interfaces import LinkInterface
+from nodes.mt.download import SLOW_BITRATE
 from nodes.node.errors import NodeLost
 from nodes.node.identify import identify
 from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, RequestReply
@@ -34,8 +36,7 @@ PIECE_S: Final = 0.01
 """Waits are cut into such: a computer that gives turns late, to whoever is waited for too, spoils but one."""
 GENTLE_SHARE: Final = 0.2
 """Of the time, while a host uses the bus: a dictionary read at full speed takes up to 70 % of 1 Mbit/s."""
-DATA_IDS: Final = range(0x102, 0x300)
-"""Data ids of the node ids 1..255."""
+T = TypeVar("T")
 FrameCallback = Callable[[Frame], None]
 MessageCallback = Callable[[Message, int], None]
 """Gets a message and when it was received (HostTime, ns)."""
@@ -45,9 +46,14 @@ class TalkError(CanductorError):
     """A node cannot be talked to, or should not."""
 
 
-def data_ids(nodeid: int) -> tuple[int, int]:
-    """Return the CAN ids to and from a node."""
-    return nodeid * 2 + 0x100, nodeid * 2 + 0x101
+def on_bus(computer: Computer, options: BusOptions, job: "Callable[[BusTalk], Awaitable[T]]") -> T:
+    """Open a bus of COMPUTER, run JOB on it and return its result; raises CanductorError."""
+
+    async def run() -> T:
+        async with BusTalk.open(computer, options) as bus:
+            return await job(bus)
+
+    return computer.run(run())
 
 
 class BusTalk:
@@ -92,9 +98,14 @@ class BusTalk:
         return self.options.name
 
     @property
-    def io(self) -> LinkIO:
-        """For its counters."""
-        return self._io
+    def bitrate(self) -> int:
+        """Bit/s; a low one if it is not known."""
+        return self._io.stats().bitrate or SLOW_BITRATE
+
+    @property
+    def load(self) -> float:
+        """Share of the bit rate that was used in the last second."""
+        return self._io.stats().load.total
 
     def send_frame(self, can_id: int, data: bytes) -> None:
         """Send one frame that belongs to no node's conversation; raises CanductorError."""
@@ -116,7 +127,7 @@ class BusTalk:
         heard = asyncio.Event()
 
         def came(frame: Frame) -> None:
-            if frame.can_id == data_ids(nodeid)[0]:
+            if frame.can_id == data_id(nodeid, Direction.TO_NODE):
                 heard.set()
 
         end = self.on_frame(came)
@@ -146,8 +157,8 @@ class BusTalk:
             talk.close()
 
     def _frame_came(self, frame: Frame) -> None:
-        if frame.can_id in DATA_IDS:
-            (self.talking if frame.can_id % 2 else self.hosted).add((frame.can_id - 0x100) // 2)
+        if owner := owner_of(frame.can_id):
+            (self.hosted if owner[1] is Direction.TO_NODE else self.talking).add(owner[0])
         for callback in tuple(self._callbacks):
             callback(frame)
 
@@ -180,7 +191,7 @@ class Line(Protocol):
 
 
 class NodeTalk:
-    """A conversation with one node whose dictionary is known; from ``NodeTalk.open`` or ``BusTalk.node``.
+    """A connection to one node whose dictionary is known; from ``BusTalk.node`` or ``open_uart_talk``.
 
     NODEID is None on a UART, which has one node.
     """
@@ -192,27 +203,6 @@ class NodeTalk:
         self._talk = RequestReply(self.name)
         self._observers: list[MessageCallback] = []
         self._lost: str | None = None
-
-    @classmethod
-    @contextlib.asynccontextmanager
-    async def open(
-        cls,
-        computer: Computer,
-        options: BusOptions,
-        nodeid: int,
-        *,
-        force: bool = False,
-        listen_s: float = LISTEN_S,
-    ) -> "AsyncIterator[NodeTalk]":
-        """Open the bus and talk to node NODEID, after LISTEN_S of silence to it.
-
-        Raises CanductorError: no such bus or node, or another host talks to it; FORCE does not listen.
-        """
-        async with BusTalk.open(computer, options) as bus:
-            if not force:
-                await refuse_if_in_use(bus, nodeid, listen_s)
-            async with bus.node(nodeid) as talk:
-                yield talk
 
     @property
     def dictionary(self) -> Dictionary:
@@ -256,6 +246,19 @@ class NodeTalk:
         return await self._talk.ask(
             name, response, args, timeout_s=timeout_s, tries=tries, survives_shutdown=True
         )
+
+    async def query(
+        self,
+        name: str,
+        response: str,
+        /,
+        *,
+        timeout_s: float = QUERY_TIMEOUT_S,
+        tries: int = QUERY_TRIES,
+        **args: Value | str,
+    ) -> Message:
+        """Do as ``ask``, but return only the response (``nodes.mt.table.TableNode``)."""
+        return (await self.ask(name, response, args, timeout_s=timeout_s, tries=tries)).message
 
     def knows(self, command: str, response: str) -> bool:
         """Tell whether the node's firmware has COMMAND and its RESPONSE."""

@@ -33,6 +33,10 @@ LIST_MAX: Final = 200
 ONLY_ONCE_S: Final = 1.5
 """How long the answer to a command is waited for that must not be sent twice."""
 _CLOCKS: Final = (("get_uptime", "uptime"), ("get_clock", "clock"))
+_COUNTERS: Final = (
+    *("commands_sent", "blocks_sent", "bytes_sent", "blocks_repeated", "naks", "timeouts"),
+    *("blocks_received", "bytes_received", "bytes_invalid"),
+)
 _PER_S: Final = 1_000_000_000
 
 
@@ -222,16 +226,8 @@ class Session:
             f"received {stats.blocks_received} blocks ({stats.bytes_received} bytes); "
             f"{stats.bytes_invalid} bytes invalid, {self.talk.undecodable} responses unknown\n"
             f"round trip {stats.srtt_s * 1000:.2f} ms, spread {stats.rttvar_s * 1000:.2f} ms",
-            stats={
-                "commands_sent": stats.commands_sent,
-                "blocks_sent": stats.blocks_sent,
-                "bytes_sent": stats.bytes_sent,
-                "blocks_repeated": stats.blocks_repeated,
-                "naks": stats.naks,
-                "timeouts": stats.timeouts,
-                "blocks_received": stats.blocks_received,
-                "bytes_received": stats.bytes_received,
-                "bytes_invalid": stats.bytes_invalid,
+            stats={name: getattr(stats, name) for name in _COUNTERS}
+            | {
                 "undecodable": self.talk.undecodable,
                 "round_trip_s": stats.srtt_s,
                 "round_trip_spread_s": stats.rttvar_s,

@@ -4,8 +4,9 @@ from collections import defaultdict
 from collections.abc import Iterator
 from typing import Final
 
+from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.discovery.inventory import InventoryEntry, NodePresence
-from canbus_tools.doctor.facts import BusAddress, NodeFacts, PingFacts
+from canbus_tools.doctor.facts import NodeFacts, PingFacts
 from canbus_tools.doctor.finding import Finding, note, problem, warning
 from canbus_tools.doctor.traffic import RTT_SPREAD_S, slow
 from nodes.support.can_protocol import FIRST_NODEID, LAST_NODEID
@@ -16,45 +17,45 @@ NODE_ERRORS: Final = 96
 """Of a node's error counters: from here on a controller warns."""
 
 
-def check_nodes(facts: NodeFacts, place: BusAddress) -> Iterator[Finding]:
+def check_nodes(facts: NodeFacts, bus: BusOptions) -> Iterator[Finding]:
     """Judge who is there, and how they are."""
     entries = facts.inventory.entries
     if not entries:
-        yield _nobody(facts, place)
+        yield _nobody(facts, bus)
     yield from _twins(entries)
     yield from _shared_ids(facts, entries)
     free = _free_id(facts)
     for entry in entries:
-        yield from _node(entry, place, free)
+        yield from _node(entry, bus, free)
     for nodeid, said in facts.silenced.items():
-        yield _went_silent(nodeid, said, place)
+        yield _went_silent(nodeid, said, bus)
     for ping in facts.pings:
-        yield from _ping(ping, place)
+        yield from _ping(ping, bus)
 
 
-def _nobody(facts: NodeFacts, place: BusAddress) -> Finding:
+def _nobody(facts: NodeFacts, bus: BusOptions) -> Finding:
     best = max(facts.heard_at.items(), key=lambda item: item[1], default=(0, 0))
     if best[1]:
         return problem(
             "other-bitrate",
-            f"no node answers on {place.name} at its bit rate, but {best[1]} frames were heard at {best[0]}"
+            f"no node answers on {bus.name} at its bit rate, but {best[1]} frames were heard at {best[0]}"
             " bit/s",
             "the nodes run at another bit rate than this interface",
-            f"sudo ip link set {place.name} down; sudo ip link set {place.name} up type can bitrate {best[0]}"
+            f"sudo ip link set {bus.name} down; sudo ip link set {bus.name} up type can bitrate {best[0]}"
             " restart-ms 100"
-            if place.socketcan
+            if bus.is_socketcan
             else f"give --bitrate {best[0]}",
         )
     tried = ", ".join(map(str, facts.heard_at))
-    at = f" at {place.bitrate} bit/s" if place.bitrate else ""
+    at = f" at {bus.bitrate} bit/s" if bus.bitrate else ""
     return problem(
         "no-nodes",
-        f"0 uuids found: no node answers on {place.name}{at}"
+        f"0 uuids found: no node answers on {bus.name}{at}"
         + (f"; nothing heard at {tried} either" if tried else ""),
         "the nodes have no power, are cut off, were built for another bit rate (CANBUS_FREQUENCY) or for "
         "USB, or run no firmware at all",
         "check power, CANH and CANL, two terminators of 120 ohm (60 between the wires), and the bit rate "
-        f"in the nodes' firmware settings; then ask again: 'canductor can query {place.words}'",
+        f"in the nodes' firmware settings; then ask again: 'canductor can query {bus.arguments}'",
     )
 
 
@@ -94,26 +95,26 @@ def _free_id(facts: NodeFacts) -> int:
     return next(nodeid for nodeid in range(FIRST_NODEID, LAST_NODEID + 2) if nodeid not in taken)
 
 
-def _went_silent(nodeid: int, said: str, place: BusAddress) -> Finding:
+def _went_silent(nodeid: int, said: str, bus: BusOptions) -> Finding:
     return problem(
         "node-went-silent",
         f"node {nodeid} said what it is, and then answered no more: {said}",
         "while it was asked it was reset, lost its power, or its controller went off the bus (bus-off); when"
         " several nodes fall silent together, this computer's adapter may have",
-        f"look whether it is back: 'canductor can nodes {place.words}'. If it waits for an id, it was reset:"
-        " look at its power; if it has its id, look at its cable, its crimp and the termination",
+        f"look whether it is back: 'canductor can nodes {bus.arguments}'. If it waits for an id, it was "
+        "reset: look at its power; if it has its id, look at its cable, its crimp and the termination",
     )
 
 
-def _node(entry: InventoryEntry, place: BusAddress, free: int) -> Iterator[Finding]:
+def _node(entry: InventoryEntry, bus: BusOptions, free: int) -> Iterator[Finding]:
     name = _name(entry)
     if entry.state is NodePresence.SHUTDOWN:
         yield warning(
             "node-shutdown",
             f"{name} is in shutdown",
             "it met an error or was told to stop, and does nothing until it is reset",
-            f"restart its host (FIRMWARE_RESTART in Klipper), or talk to it: 'canductor console {place.words}"
-            f" --node {entry.nodeid}', and there: reset",
+            "restart its host (FIRMWARE_RESTART in Klipper), or talk to it: 'canductor console "
+            f"{bus.arguments} --node {entry.nodeid}', and there: reset",
         )
     elif entry.state is NodePresence.BOOTLOADER:
         yield warning(
@@ -128,14 +129,14 @@ def _node(entry: InventoryEntry, place: BusAddress, free: int) -> Iterator[Findi
             f"{name} waits for an id",
             "that is normal as long as no host runs that has it in its configuration",
             "put its uuid into the host's configuration; to try it:"
-            f" 'canductor can assign {entry.uuid} {free} {place.words}'",
+            f" 'canductor can assign {entry.uuid} {free} {bus.arguments}'",
         )
     elif entry.state is NodePresence.UNCLEAR and entry.trouble and "more than one board" not in entry.trouble:
         yield warning(
             "node-unclear",
             f"{name}: {entry.trouble}",
             "it could not be asked how it is",
-            f"switch it off and on, then look again: 'canductor can nodes {place.words}'",
+            f"switch it off and on, then look again: 'canductor can nodes {bus.arguments}'",
         )
     status = entry.facts.can if entry.facts is not None else None
     if status is not None and (
@@ -151,7 +152,7 @@ def _node(entry: InventoryEntry, place: BusAddress, free: int) -> Iterator[Findi
         )
 
 
-def _ping(ping: PingFacts, place: BusAddress) -> Iterator[Finding]:
+def _ping(ping: PingFacts, bus: BusOptions) -> Iterator[Finding]:
     if ping.lost or ping.invalid_bytes:
         found = problem if ping.lost > LOSS_MANY * ping.asked else warning
         yield found(
@@ -161,7 +162,7 @@ def _ping(ping: PingFacts, place: BusAddress) -> Iterator[Finding]:
             " repeated)",
             "frames get lost between this program and the node. On the wire controllers repeat what was "
             "damaged, so it is the adapter, the kernel, or the node's receive buffer",
-            f"look at the counters: ip -details -statistics link show {place.name}; try another USB port, "
+            f"look at the counters: ip -details -statistics link show {bus.name}; try another USB port, "
             "cable or adapter, and a kernel of 6.6 or newer",
         )
     if ping.rtt_p99_s > RTT_SPREAD_S:

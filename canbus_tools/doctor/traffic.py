@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from typing import Final
 
-from canbus_tools.doctor.facts import BusAddress, DirectionFacts, InterfaceFacts, TrafficFacts
+from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.doctor.facts import DirectionFacts, InterfaceFacts, TrafficFacts
 from canbus_tools.doctor.finding import Finding, note, problem, warning
 from canbus_tools.doctor.interface import CABLE
 from canbus_tools.doctor.known_faults import CANDLELIGHT_FAULT, CANDLELIGHT_USB
@@ -18,12 +19,12 @@ WIRE_ERRORS: Final = ("form", "stuff", "bit")
 
 
 def check_traffic(
-    facts: TrafficFacts, interface: InterfaceFacts | None, place: BusAddress
+    facts: TrafficFacts, interface: InterfaceFacts | None, bus: BusOptions
 ) -> Iterator[Finding]:
     """Judge what was observed."""
-    yield from _load(facts, place)
+    yield from _load(facts, bus)
     yield from _errors(facts)
-    yield from _lost(facts, place)
+    yield from _lost(facts, bus)
     for way in facts.nodes:
         yield from _node(way, interface)
     if facts.other_frames:
@@ -31,18 +32,18 @@ def check_traffic(
             "other-protocol",
             f"{facts.other_frames} of {facts.frames} frames belong to no node of this protocol",
             "another protocol shares the bus; that works, but takes its part of the time",
-            f"see who: 'canductor can load {place.words}'",
+            f"see who: 'canductor can load {bus.arguments}'",
         )
 
 
-def _load(facts: TrafficFacts, place: BusAddress) -> Iterator[Finding]:
+def _load(facts: TrafficFacts, bus: BusOptions) -> Iterator[Finding]:
     if facts.load is None or facts.load.mean < LOAD_HIGH:
         return
     load = facts.load
     busiest = max(load.classes.items(), key=lambda item: item[1].bits)
     seen = f"the bus is {load.mean:.0%} busy, most of it by frames of the class '{busiest[0].value}'"
     do = (
-        f"see who sends so much: 'canductor can load {place.words} --watch'; a higher bit rate (all nodes "
+        f"see who sends so much: 'canductor can load {bus.arguments} --watch'; a higher bit rate (all nodes "
         "have to be flashed for it), or a second bus for some of the nodes, makes room"
     )
     if load.mean >= LOAD_FULL:
@@ -91,7 +92,7 @@ def _errors(facts: TrafficFacts) -> Iterator[Finding]:
             )
 
 
-def _lost(facts: TrafficFacts, place: BusAddress) -> Iterator[Finding]:
+def _lost(facts: TrafficFacts, bus: BusOptions) -> Iterator[Finding]:
     if facts.send_queue_full:
         yield problem(
             "send-queue-full",
@@ -99,8 +100,8 @@ def _lost(facts: TrafficFacts, place: BusAddress) -> Iterator[Finding]:
             " ENOBUFS)",
             "the queue is very short, or full because nothing leaves it: nobody acknowledges, or the bus is"
             " busy with frames that win arbitration",
-            f"sudo ip link set {place.name} txqueuelen 128; if it persists, see who is there:"
-            f" 'canductor can load {place.words}'",
+            f"sudo ip link set {bus.name} txqueuelen 128; if it persists, see who is there:"
+            f" 'canductor can load {bus.arguments}'",
         )
     if facts.errors.get("overflow"):
         yield warning(

@@ -209,7 +209,6 @@ class _CommandStream(_Stream):
     def _block(self, out: list[Decoded], block: bytes, frame: Frame) -> None:
         node = self._node
         time_s, channel = frame[0], frame[4]
-        node.last_sent_s = time_s
         seq = block[1] & SEQUENCE_MASK
         repeated = node.flow.sent(block, time_s)
         content = block[2:-3]

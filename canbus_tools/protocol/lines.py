@@ -7,6 +7,7 @@ from functools import lru_cache
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.protocol import Direction
 from canbus_tools.protocol.traffic import NodeTraffic
+from canbus_tools.support.text_table import table
 
 _ENDS = {Direction.TO_NODE: "to", Direction.FROM_NODE: "from", Direction.ANY: "from"}
 _NOBODY = {Direction.TO_NODE: "to all", Direction.FROM_NODE: "from ?", Direction.ANY: "-"}
@@ -35,7 +36,7 @@ _HEADINGS = ("node", "uuid", "mcu", "frames", "to", "from", "repeated", "missed"
 
 def table_of(nodes: Iterable[NodeTraffic]) -> str:
     """Return each node's counters as lines with a heading; to and from count messages."""
-    rows: list[tuple[str, ...]] = [(*_HEADINGS, "round trip (median, p99)")]
+    rows: list[tuple[str, ...]] = []
     for node in nodes:
         ways = (node.to_node, node.from_node)
         cells = (
@@ -52,10 +53,7 @@ def table_of(nodes: Iterable[NodeTraffic]) -> str:
             round_trip_text(node),
         )
         rows.append(tuple(map(str, cells)))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+    return "\n".join(table((*_HEADINGS, "round trip (median, p99)"), rows, indent=""))
 
 
 def round_trip_text(node: NodeTraffic) -> str:

@@ -147,8 +147,8 @@ def test_decode_says_that_it_guessed(tmp_path: Path, capsys: pytest.CaptureFixtu
     said = capsys.readouterr()
     assert "clock clock=" in said.out.splitlines()[-1]
     assert said.err == (
-        f"canductor: node 4: its dictionary (twin {DICTIONARY.version}) is guessed: the cache has it, and it"
-        " explains what was heard; --dictionary 4=FILE makes sure\n"
+        f"canductor: node 4: its dictionary (twin {DICTIONARY.version}) is guessed: a dictionary in the"
+        " cache explains its traffic; give --dictionary 4=FILE to be certain\n"
     )
 
 

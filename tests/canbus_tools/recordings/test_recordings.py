@@ -133,12 +133,24 @@ def test_any_bytes_as_a_candump_log(log: bytes) -> None:
 # -------------------------------------------------------------------------------------- formats of python-can
 
 
+def to_message(frame: Frame) -> can.Message:
+    return can.Message(
+        timestamp=frame.time_s,
+        arbitration_id=frame.can_id,
+        data=frame.data,
+        is_extended_id=frame.kind is FrameKind.EXTENDED,
+        is_remote_frame=frame.kind is FrameKind.REMOTE,
+        is_error_frame=frame.kind is FrameKind.ERROR,
+        is_fd=frame.kind is FrameKind.FD,
+    )
+
+
 @pytest.mark.parametrize(("suffix", "writer"), [("blf", can.BLFWriter), ("asc", can.ASCWriter)])
 def test_blf_and_asc(tmp_path: Path, suffix: str, writer: Callable[[str], can.Listener]) -> None:
     path = tmp_path / f"some.{suffix}"
     log = writer(str(path))
     for frame in FRAMES:
-        message = frame.to_message()
+        message = to_message(frame)
         message.channel = 0
         log.on_message_received(message)
     log.stop()
@@ -153,7 +165,7 @@ def test_truncated_blf(tmp_path: Path) -> None:
     path = tmp_path / "some.blf"
     log = can.BLFWriter(str(path), max_container_size=400)
     for frame in FRAMES * 20:
-        log.on_message_received(frame._replace(channel="").to_message())
+        log.on_message_received(to_message(frame))
     log.stop()
     path.write_bytes(path.read_bytes()[:-150])
     found, problem = read_all(path)
