@@ -8,7 +8,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, Final
@@ -150,18 +150,12 @@ def tables(dictionaries: Mapping[int | str, Dictionary]) -> dict[str, Any]:
 
 
 def _frame(kind: str, known: FrameFormat) -> dict[str, Any]:
-    return {
+    return asdict(known) | {
         "kind": kind,
-        "name": known.name,
         "direction": known.direction.value,
-        "can_id": known.can_id,
-        "ids": known.ids,
-        "command": known.command,
         "size": known.size,
         "fields_at": known.fields_at,
         "fields": [f.name for f in known.fields],
-        "extension": known.extension,
-        "sentence": known.sentence,
     }
 
 

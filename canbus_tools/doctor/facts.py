@@ -36,7 +36,6 @@ class DirectionFacts:
     """What was observed of one node; blocks are the protocol's."""
 
     nodeid: int
-    from_blocks: int
     to_blocks: int
     invalid_bytes: int
     """That the node sent and that made no block here."""

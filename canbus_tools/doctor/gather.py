@@ -174,7 +174,6 @@ class BusListener:
             found.append(
                 DirectionFacts(
                     nodeid=nodeid,
-                    from_blocks=node.from_node.blocks,
                     to_blocks=node.to_node.blocks,
                     # A single stretch may be the end of a block that began before this listener.
                     invalid_bytes=node.from_node.invalid_bytes if node.from_node.noises > 1 else 0,

@@ -164,12 +164,6 @@ class SocketcandSession:
         self._held_until_s = now_s + SETTLE_S if mode is Mode.RAW else -math.inf
         self._say("ok")
 
-    def _raw_mode(self, words: list[str], now_s: float) -> None:
-        self._change_mode(Mode.RAW, words, now_s)
-
-    def _bcm_mode(self, words: list[str], now_s: float) -> None:
-        self._change_mode(Mode.BCM, words, now_s)
-
     def _echo(self, words: list[str], _: float) -> None:
         _no_more("echo", words)
         self._say("echo")
@@ -337,8 +331,8 @@ _Command = Callable[[SocketcandSession, list[str], float], None]
 _BOTH: Final[dict[str, _Command]] = {
     "send": SocketcandSession._send,  # noqa: SLF001
     "echo": SocketcandSession._echo,  # noqa: SLF001
-    "rawmode": SocketcandSession._raw_mode,  # noqa: SLF001
-    "bcmmode": SocketcandSession._bcm_mode,  # noqa: SLF001
+    "rawmode": lambda self, *given: self._change_mode(Mode.RAW, *given),
+    "bcmmode": lambda self, *given: self._change_mode(Mode.BCM, *given),
 }
 _COMMANDS: Final[dict[Mode, dict[str, _Command]]] = {
     Mode.NO_BUS: {"open": SocketcandSession._open, "echo": SocketcandSession._echo},  # noqa: SLF001

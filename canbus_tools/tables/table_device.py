@@ -12,8 +12,7 @@ from typing import Final
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.link_facts import read_link
 from canbus_tools.bus.open_bus import BusOptions
-from canbus_tools.bus.talk import BusTalk, TalkError, refuse_if_in_use
-from canbus_tools.bus.uart_talk import open_uart_talk
+from canbus_tools.bus.talk import BusTalk, TalkError, open_uart_talk, refuse_if_in_use
 from canbus_tools.tables.table_nodes import (
     NodeTables,
     TableReport,

@@ -12,7 +12,7 @@ from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError, in_use, on_bus, refuse_if_in_use
 from canbus_tools.discovery.ask_bus import declare_listen, discover_nodes
 from canbus_tools.discovery.inventory import NodePresence, take_inventory
-from canbus_tools.discovery.node_discovery import Application, DiscoveredNodes, WaitingNode
+from canbus_tools.discovery.node_discovery import DiscoveredNodes, WaitingNode
 from canbus_tools.tools.assign_id import parse_uuid
 from canbus_tools.tools.query import application_name
 from nodes.bus.assign import AssignError, Uuid
@@ -55,15 +55,13 @@ def _node(given: str) -> Uuid | int:
     return parse_uuid(text)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class ReleaseReport:
     """A node that waits for an id."""
 
     bus: BusOptions
-    uuid: Uuid
-    application: Application
-    text: str
-    nodeid: int | None
+    node: WaitingNode
+    nodeid: int | None = None
     """The id that it had, if any."""
     ok: bool = True
 
@@ -71,15 +69,17 @@ class ReleaseReport:
         """Return all of it."""
         return {
             "bus": self.bus.name,
-            "uuid": str(self.uuid),
+            "uuid": str(self.node.uuid),
             "nodeid": self.nodeid,
-            "application": self.application.value,
+            "application": self.node.application.value,
             "waited_before": self.nodeid is None,
         }
 
     def to_text(self) -> str:
         """Return one line."""
-        return self.text
+        waits = "waits for an id already" if self.nodeid is None else "was reset and waits for an id now"
+        had = "" if self.nodeid is None else f"had id {self.nodeid}, "
+        return f"{self.node.uuid} {had}{waits} ({application_name(self.node)})"
 
 
 async def release(
@@ -94,23 +94,12 @@ async def release(
     else:
         waits = _waiting(before, node)
         if waits is not None and node not in before.twins:
-            return _report(bus, waits, None)
+            return ReleaseReport(bus.options, waits)
         nodeid = await _find(bus, node, before, force=force, listen_s=listen_s)
     uuid = await _reset(bus, nodeid)
     expected = uuid or (node if isinstance(node, Uuid) else None)
     returned = await _returned(bus, nodeid, expected, before)
-    return _report(bus, returned, nodeid)
-
-
-def _report(bus: BusTalk, node: WaitingNode, nodeid: int | None) -> ReleaseReport:
-    what = application_name(node)
-    if nodeid is None:
-        text = f"{node.uuid} waits for an id already ({what})"
-    else:
-        text = f"{node.uuid} had id {nodeid}, was reset and waits for an id now ({what})"
-    return ReleaseReport(
-        bus=bus.options, uuid=node.uuid, application=node.application, text=text, nodeid=nodeid
-    )
+    return ReleaseReport(bus.options, returned, nodeid)
 
 
 def _waiting(discovery: DiscoveredNodes, uuid: Uuid) -> WaitingNode | None:
@@ -154,7 +143,7 @@ async def _reset(bus: BusTalk, nodeid: int) -> Uuid | None:
         if talk.knows("get_canbus_id", "canbus_id"):
             answer = (await talk.ask("get_canbus_id", "canbus_id")).message.params.get("canbus_uuid")
             uuid = Uuid(answer) if isinstance(answer, bytes) and len(answer) == UUID_SIZE else None
-        talk.send_text(RESET)
+        talk.send(RESET)
         with contextlib.suppress(TimeoutError, CanductorError):  # it may reset without an acknowledgement
             await asyncio.wait_for(talk.drained(), LEAVE_S)
         return uuid

@@ -153,9 +153,7 @@ def test_an_adapter_is_read_from_sys(tmp_path: Path) -> None:
 
 
 def test_invalid_bytes_name_the_adapter_and_acquit_the_wiring() -> None:
-    way = DirectionFacts(
-        nodeid=5, from_blocks=900, to_blocks=900, invalid_bytes=40, repeated_blocks=0, naks=0
-    )
+    way = DirectionFacts(nodeid=5, to_blocks=900, invalid_bytes=40, repeated_blocks=0, naks=0)
     means = judge_traffic(TrafficFacts(listened_s=3.0, nodes=(way,)))["bytes-invalid"].means
     assert "candleLight firmware before 2.0" in means
     assert "Bad wiring does not do that" in means
@@ -168,7 +166,6 @@ def test_invalid_bytes_name_the_adapter_and_acquit_the_wiring() -> None:
 def test_repeats_and_slow_answers_of_another_host() -> None:
     way = DirectionFacts(
         nodeid=5,
-        from_blocks=900,
         to_blocks=900,
         invalid_bytes=0,
         repeated_blocks=30,

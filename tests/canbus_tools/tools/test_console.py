@@ -118,7 +118,7 @@ def test_an_error_ends_a_script_with_its_line(node: CanStage, can_tool: Command,
     script.write_bytes(b"get_clock\n\xff\xfe\n")
     said = can_tool.console("--node", MAIN_ID, "--script", script)
     assert said.status == 1
-    assert "no text in UTF-8" in said.err
+    assert "is not UTF-8 text" in said.err
 
 
 def test_quit_ends_a_script(on_4: OnNode) -> None:
