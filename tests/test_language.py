@@ -33,6 +33,13 @@ RETIRED = {
     "Desk": "Endpoint",
     "Reactions": "Engine",
     "Scanner": "Lexer",
+    "ThisComputer": "Computer",
+    "BusAddress": "BusOptions",
+    "TalkBus": "BusTalk",
+    "TableTalk": "NodeTables",
+    "by_nodeid": "nodeid",
+    "end_of_calm": "start_of_queries",
+    "release_on": "release",
 }
 """By the name that is refused: what to write instead."""
 SEARCHED = ("coordinator", "nodes", "canbus_tools", "tests", "bench", "docs", "README.md", "CONTRIBUTING.md")

@@ -22,13 +22,13 @@ from typing import Final, NamedTuple
 
 import can
 
+from canbus_tools.bus.open_bus import BITRATE_MAX, BITRATE_MIN
 from canbus_tools.protocol.frame import Frame, FrameKind
 from canbus_tools.protocol.protocol import SIGNAL_FRAMES, Direction, owner_of
 from nodes.support._can_bits import ffi, lib
 from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.support.errors import CanductorError
 
-BITRATE_MIN, BITRATE_MAX = 10_000, 1_000_000
 WINDOW_S: Final = 1.0
 WINDOW_S_MIN, WINDOW_S_MAX = 0.01, 3600.0
 WINDOWS_MAX: Final = 1024

@@ -5,7 +5,6 @@ import socket
 import threading
 import time
 from collections import deque
-from types import TracebackType
 from typing import Final, Self
 
 import can
@@ -44,9 +43,7 @@ class FrameQueue:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ending = True
         self._thread.join()
         self._bus.shutdown()

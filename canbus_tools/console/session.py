@@ -45,7 +45,7 @@ class Quit(Exception):  # noqa: N818 (no failure)
 
 
 class Session:
-    """Carries out lines on a conversation with a node; SAY gets each line of output.
+    """Executes lines on a connection to a node; SAY receives each line of output.
 
     With AS_JSON each message is one JSON object in a line. Use from one event loop.
     """
@@ -151,7 +151,7 @@ class Session:
         freq_hz = frequency_hz(self.dictionary)
         known = next(((ask, says) for ask, says in _CLOCKS if self.talk.knows(ask, says)), None)
         if known is None or freq_hz is None:
-            raise ConsoleError("the node's firmware does not tell its clock, so 'clock' has no value")
+            raise ConsoleError("the node's firmware does not report its clock, so 'clock' has no value")
         self._own_question = known[1]
         try:
             answer = await self.talk.ask(*known)

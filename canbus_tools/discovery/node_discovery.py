@@ -142,10 +142,6 @@ class NodeDiscovery:
         """Number of invalid answers, or of answers from boards beyond MAX_UUIDS."""
         self.deadline_ns: int | None = None
 
-    def start(self, now_ns: int) -> None:
-        """Begin the first round."""
-        self._next_round(now_ns)
-
     def frames_to_send(self) -> list[AdminFrame]:
         """Return the frames to be sent now, once."""
         frames, self._outbox = self._outbox, []
@@ -175,7 +171,7 @@ class NodeDiscovery:
         if enough or self._rounds >= max(ROUNDS_MAX, self._rounds_min):
             self.deadline_ns = None
         else:
-            self._next_round(now_ns)
+            self.start(now_ns)
 
     def result(self) -> DiscoveredNodes:
         """Return the nodes found so far."""
@@ -202,7 +198,8 @@ class NodeDiscovery:
 
     # ----------------------------------------------------------------------------------------------- inside
 
-    def _next_round(self, now_ns: int) -> None:
+    def start(self, now_ns: int) -> None:
+        """Start a round."""
         self._rounds += 1
         self._quiet_rounds += 1
         for question in (WHO_IS_HERE, QUERY_UNASSIGNED):

@@ -1,4 +1,4 @@
-"""Whether the interface is fit for use."""
+"""Checks of the interface."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -22,7 +22,7 @@ ERRORS_PASSIVE: Final = 128
 
 
 def check_presence(facts: InterfaceFacts) -> Iterator[Finding]:
-    """Find an interface that is not there, is none of CAN, or is down; nothing else works before."""
+    """Check that the interface exists, is a CAN interface and is up, without which nothing else works."""
     name, link = facts.name, facts.link
     if link is None:
         there = ", ".join(facts.others)
@@ -30,15 +30,15 @@ def check_presence(facts: InterfaceFacts) -> Iterator[Finding]:
             "interface-missing",
             f"there is no network interface {name}; CAN interfaces here: {there or 'none'}",
             "the adapter is not plugged in, its driver is not loaded, or the interface has another name",
-            f"use one that is there: 'canductor can doctor -c {facts.others[0]}'"
+            f"use an existing one: 'canductor can doctor -c {facts.others[0]}'"
             if there
-            else "plug the adapter in and look what the kernel says: dmesg | grep -i can",
+            else "plug the adapter in and check the kernel's messages: dmesg | grep -i can",
         )
     elif not link.kind:
         yield problem(
             "not-can",
-            f"{name} is a network interface, but not of CAN",
-            "nothing of this protocol can go over it",
+            f"{name} is not a CAN interface",
+            "this protocol cannot use it",
             f"use a CAN interface ({', '.join(facts.others) or 'there is none here'})",
         )
     elif not link.up:
@@ -46,14 +46,13 @@ def check_presence(facts: InterfaceFacts) -> Iterator[Finding]:
         yield problem(
             "interface-down",
             f"{name} is down",
-            "it neither sends nor receives; nobody set it up since the machine started, or somebody took it"
-            " down",
+            "it neither sends nor receives; it was not set up since the machine started, or was taken down",
             f"sudo ip link set {name} up{bitrate}",
         )
 
 
 def check_link(facts: InterfaceFacts) -> Iterator[Finding]:
-    """Judge how the interface is set, and what its controller has counted."""
+    """Check the settings of the interface and the counters of its controller."""
     if facts.link is None or not facts.link.up:
         return
     yield from _queue(facts.link)
@@ -159,7 +158,7 @@ CABLE: Final = (
 def _cause(tx: int, rx: int) -> str:
     if tx > rx:
         return (
-            "what it sends is not acknowledged: nobody else is on the bus, or all others run at another bit "
+            "its frames are not acknowledged: no other node is on the bus, or all others run at another bit "
             "rate, have no power or are cut off"
         )
     return (

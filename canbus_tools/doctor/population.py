@@ -1,4 +1,4 @@
-"""Whether the nodes are well."""
+"""Checks of the nodes."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ from nodes.support.can_protocol import FIRST_NODEID, LAST_NODEID
 SAID_ACTIVE: Final = "active"
 LOSS_MANY: Final = 0.02
 NODE_ERRORS: Final = 96
-"""Of a node's error counters: from here on a controller warns."""
+"""Value of a node's error counters from which a controller is in the state "warning"."""
 
 
 def check_nodes(facts: NodeFacts, bus: BusOptions) -> Iterator[Finding]:
-    """Judge who is there, and how they are."""
+    """Check which nodes there are, and their state."""
     entries = facts.inventory.entries
     if not entries:
-        yield _nobody(facts, bus)
+        yield _no_nodes(facts, bus)
     yield from _twins(entries)
     yield from _shared_ids(facts, entries)
     free = _free_id(facts)
@@ -33,7 +33,7 @@ def check_nodes(facts: NodeFacts, bus: BusOptions) -> Iterator[Finding]:
         yield from _ping(ping, bus)
 
 
-def _nobody(facts: NodeFacts, bus: BusOptions) -> Finding:
+def _no_nodes(facts: NodeFacts, bus: BusOptions) -> Finding:
     best = max(facts.heard_at.items(), key=lambda item: item[1], default=(0, 0))
     if best[1]:
         return problem(
@@ -67,7 +67,7 @@ def _twins(entries: tuple[InventoryEntry, ...]) -> Iterator[Finding]:
             f"more than one board answers with the uuid {uuid}",
             "their chips have the same serial number (cloned chips), or one wrote the other's: a host "
             "cannot tell them apart, and both would take one id",
-            "take one of them off the bus, or build its firmware with a uuid of its own",
+            "disconnect one of them, or build its firmware with a different uuid",
         )
 
 
@@ -98,7 +98,7 @@ def _free_id(facts: NodeFacts) -> int:
 def _went_silent(nodeid: int, said: str, bus: BusOptions) -> Finding:
     return problem(
         "node-went-silent",
-        f"node {nodeid} said what it is, and then answered no more: {said}",
+        f"node {nodeid} answered its first queries, but no further ones: {said}",
         "while it was asked it was reset, lost its power, or its controller went off the bus (bus-off); when"
         " several nodes fall silent together, this computer's adapter may have",
         f"look whether it is back: 'canductor can nodes {bus.arguments}'. If it waits for an id, it was "
@@ -112,7 +112,7 @@ def _node(entry: InventoryEntry, bus: BusOptions, free: int) -> Iterator[Finding
         yield warning(
             "node-shutdown",
             f"{name} is in shutdown",
-            "it met an error or was told to stop, and does nothing until it is reset",
+            "an error or an emergency stop made it shut down; it does nothing until it is reset",
             "restart its host (FIRMWARE_RESTART in Klipper), or talk to it: 'canductor console "
             f"{bus.arguments} --node {entry.nodeid}', and there: reset",
         )
@@ -120,14 +120,14 @@ def _node(entry: InventoryEntry, bus: BusOptions, free: int) -> Iterator[Finding
         yield warning(
             "node-in-bootloader",
             f"{name} is in its bootloader (Katapult)",
-            "it has no firmware that runs, or somebody asked for the bootloader: no host can use it",
+            "its firmware did not start, or the bootloader was requested: no host can use it",
             f"flash it (flashtool.py -u {entry.uuid}), or press reset once",
         )
     elif entry.state is NodePresence.WAITING and not entry.twins:
         yield note(
             "node-waits",
             f"{name} waits for an id",
-            "that is normal as long as no host runs that has it in its configuration",
+            "that is normal while no host runs that has this node in its configuration",
             "put its uuid into the host's configuration; to try it:"
             f" 'canductor can assign {entry.uuid} {free} {bus.arguments}'",
         )
@@ -135,8 +135,8 @@ def _node(entry: InventoryEntry, bus: BusOptions, free: int) -> Iterator[Finding
         yield warning(
             "node-unclear",
             f"{name}: {entry.trouble}",
-            "it could not be asked how it is",
-            f"switch it off and on, then look again: 'canductor can nodes {bus.arguments}'",
+            "its state could not be read",
+            f"switch it off and on, then check again: 'canductor can nodes {bus.arguments}'",
         )
     status = entry.facts.can if entry.facts is not None else None
     if status is not None and (
@@ -144,11 +144,11 @@ def _node(entry: InventoryEntry, bus: BusOptions, free: int) -> Iterator[Finding
     ):
         yield warning(
             "node-can-errors",
-            f"{name} says: error counters {status.rx_errors} receiving, {status.tx_errors} sending,"
+            f"{name} reports: error counters {status.rx_errors} receiving, {status.tx_errors} sending,"
             f" {status.tx_retries} retries, bus state {status.state}",
-            "its place on the bus is bad: its crimp, its stub, or a terminator near it",
-            "swap its cable with that of a good node and look whether the counters follow the cable or the"
-            " board",
+            "its connection to the bus is bad: its crimp, its stub, or a terminator near it",
+            "swap its cable with that of a good node, and check whether the errors follow the "
+            "cable or the board",
         )
 
 
@@ -157,7 +157,7 @@ def _ping(ping: PingFacts, bus: BusOptions) -> Iterator[Finding]:
         found = problem if ping.lost > LOSS_MANY * ping.asked else warning
         yield found(
             "frames-lost",
-            f"of {ping.asked} questions to node {ping.nodeid}, {ping.lost} got lost with no trace, and"
+            f"of {ping.asked} queries to node {ping.nodeid}, {ping.lost} got lost without a trace, and"
             f" {ping.invalid_bytes} bytes of its answers were no valid block ({ping.repeats} blocks were"
             " repeated)",
             "frames get lost between this program and the node. On the wire controllers repeat what was "
@@ -166,7 +166,7 @@ def _ping(ping: PingFacts, bus: BusOptions) -> Iterator[Finding]:
             "cable or adapter, and a kernel of 6.6 or newer",
         )
     if ping.rtt_p99_s > RTT_SPREAD_S:
-        yield slow(ping.nodeid, ping.rtt_median_s, ping.rtt_p99_s, f"{ping.asked} questions")
+        yield slow(ping.nodeid, ping.rtt_median_s, ping.rtt_p99_s, f"{ping.asked} queries")
 
 
 def _name(entry: InventoryEntry) -> str:

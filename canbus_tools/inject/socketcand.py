@@ -58,10 +58,10 @@ class Subscription:
     mask: bytes | None
     """None: every frame; else only frames in which these bits, or the length, changed."""
     last: CanFrame | None = None
-    """The frame that was told last."""
+    """The last frame that was sent to the client."""
     next_s: float = -math.inf
     waiting: tuple[CanFrame, float] | None = None
-    """A frame and its Unix time, to be told at ``next_s``."""
+    """A frame and its Unix time, to be sent to the client at ``next_s``."""
 
     def is_new(self, frame: CanFrame) -> bool:
         """Whether the client wants to hear this frame."""
@@ -218,10 +218,10 @@ class SocketcandSession:
                 self._held.append((frame, unix_s))
             else:
                 self._let_go()
-                self._tell(frame, unix_s)
+                self._send_frame(frame, unix_s)
         elif (wanted := self._subscriptions.get(frame.id)) is not None and wanted.is_new(frame):
             wanted.waiting = (frame, unix_s)
-            self._tell_waiting(wanted, now_s)
+            self._send_waiting(wanted, now_s)
 
     def next_deadline(self) -> float:
         """When ``handle_timer`` has something to do; infinite when it has not."""
@@ -236,7 +236,7 @@ class SocketcandSession:
         if now_s >= self._held_until_s:
             self._let_go()
         for wanted in self._subscriptions.values():
-            self._tell_waiting(wanted, now_s)
+            self._send_waiting(wanted, now_s)
         for job in self._jobs.values():
             if now_s >= job.due_s:
                 self._frames.append(job.frame)
@@ -246,17 +246,17 @@ class SocketcandSession:
 
     def _let_go(self) -> None:
         for frame, unix_s in self._held:
-            self._tell(frame, unix_s)
+            self._send_frame(frame, unix_s)
         self._held.clear()
 
-    def _tell_waiting(self, wanted: Subscription, now_s: float) -> None:
+    def _send_waiting(self, wanted: Subscription, now_s: float) -> None:
         if wanted.waiting is None or now_s < wanted.next_s:
             return
         frame, unix_s = wanted.waiting
         wanted.waiting, wanted.last, wanted.next_s = None, frame, now_s + wanted.interval_s
-        self._tell(frame, unix_s)
+        self._send_frame(frame, unix_s)
 
-    def _tell(self, frame: CanFrame, unix_s: float) -> None:
+    def _send_frame(self, frame: CanFrame, unix_s: float) -> None:
         # Data in one word, as socketcand itself does (its document shows spaces); without any, two spaces.
         self._say(f"frame {frame.id:03X} {unix_s:.6f} {frame.data.hex().upper()}")
 

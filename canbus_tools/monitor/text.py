@@ -150,15 +150,12 @@ def log_line(said: Decoded, width: int) -> Text:
     seconds = said.time_s % 60
     clock = time.strftime("%H:%M", time.localtime(said.time_s)) if 0 <= said.time_s < 1 << 33 else "--:--"
     text.append(f"{clock}:{seconds:09.6f} ", "dim")
+    style = "cyan" if said.direction is Direction.TO_NODE else "green"
     arrow = {Direction.TO_NODE: "→", Direction.FROM_NODE: "←"}.get(said.direction, " ")
-    text.append(f"{'' if said.nodeid is None else said.nodeid:>3} {arrow} ", _way_style(said))
+    text.append(f"{'' if said.nodeid is None else said.nodeid:>3} {arrow} ", style)
     room = max(ROOM_MIN, width - len(text))
     pieces = textwrap.wrap(said.text, room, break_on_hyphens=False) or [""]
     text.append(("\n" + " " * len(text)).join(pieces), _STYLES.get(said.kind, ""))
     if said.repeated:
         text.append("  repeated", "yellow")
     return text
-
-
-def _way_style(said: Decoded) -> str:
-    return "cyan" if said.direction is Direction.TO_NODE else "green"

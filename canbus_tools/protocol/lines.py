@@ -1,4 +1,4 @@
-"""How the tools write what was said on a bus, and each node's counters, as plain text."""
+"""Plain text of decoded messages and of each node's counters."""
 
 import math
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ _WORDS = {
 
 
 def line_of(said: Decoded) -> str:
-    """Return time, bus, whom it goes to or comes from, and the text; without the line's end."""
+    """Return a line with time, bus, receiver or sender and the text, without the line's end."""
     time_s, channel, nodeid, direction, _, _, repeated, shape, values = said
     again = "  (repeated)" if repeated else ""
     return f"{time_s:.6f}  {printable(channel)}  {_WORDS[nodeid, direction]}  {shape.text(values)}{again}"
@@ -59,9 +59,4 @@ def table_of(nodes: Iterable[NodeTraffic]) -> str:
 def round_trip_text(node: NodeTraffic) -> str:
     """Return the median and the 99th percentile of a node's round trips."""
     median_s, p99_s = (node.flow.round_trips.quantile_s(share) for share in (0.5, 0.99))
-    return "-" if math.isnan(median_s) else f"{milliseconds(median_s)}, {milliseconds(p99_s)}"
-
-
-def milliseconds(time_s: float) -> str:
-    """Return a time with three digits that count."""
-    return f"{time_s * 1e3:.3g} ms"
+    return "-" if math.isnan(median_s) else f"{median_s * 1e3:.3g} ms, {p99_s * 1e3:.3g} ms"

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from canbus_tools.bus.bus_load import BITRATE_MAX, LoadMeter
+from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.bus.computer import Computer, Listener, now_s
-from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
+from canbus_tools.bus.open_bus import BITRATE_MAX, BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import BusTalk, refuse_if_in_use
 from canbus_tools.bus.until_stopped import StopFlag, stop_flag
 from canbus_tools.discovery.inventory import take_inventory

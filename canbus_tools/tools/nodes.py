@@ -111,7 +111,7 @@ class NodesReport:
         entries = self.found.entries
         lines = [f"{count(self.found.boards, 'node')} on {self.bus.name}", ""]
         if not entries:
-            return "\n".join(lines + _nobody(self.bus, self.found))
+            return "\n".join(lines + _no_nodes(self.bus, self.found))
         lines += [*table(HEADINGS, [_row(entry) for entry in entries]), ""]
         notes = _notes(self.found, self.bus)
         return "\n".join(lines + [line for note in notes for line in paragraph(note)]).rstrip()
@@ -209,7 +209,7 @@ def _name(entry: InventoryEntry) -> str:
     return str(entry.uuid) if entry.nodeid is None else str(entry.nodeid)
 
 
-def _nobody(bus: BusOptions, found: Inventory) -> list[str]:
+def _no_nodes(bus: BusOptions, found: Inventory) -> list[str]:
     tried = f"ids {found.probed[0]} to {found.probed[-1]}" if found.probed else "no ids (--probe none)"
     lines = paragraph(
         "No node waits for an id, none reports that it has one, no host was heard that uses one, and none "

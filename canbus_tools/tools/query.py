@@ -95,7 +95,7 @@ class QueryReport:
             lines += ["", *table(("uuid", "application", "answers", ""), rows), ""]
             lines += _notes(found)
         else:
-            lines += ["", *_why_nobody(found, self.bus)]
+            lines += ["", *_why_none(found, self.bus)]
         return "\n".join(lines)
 
 
@@ -134,7 +134,7 @@ def _notes(found: DiscoveredNodes) -> list[str]:
     return [line for note in notes for line in paragraph(note)]
 
 
-def _why_nobody(found: DiscoveredNodes, bus: BusOptions) -> list[str]:
+def _why_none(found: DiscoveredNodes, bus: BusOptions) -> list[str]:
     """Explain why no node answered, which is usually no fault."""
     ids = assigned_ids(found)
     lines = []

@@ -92,7 +92,7 @@ async def release(
         if not force:
             await refuse_if_in_use(bus, nodeid, listen_s)
     else:
-        waits = _waiting(before, node)
+        waits = next((waiting for waiting in before.waiting if waiting.uuid == node), None)
         if waits is not None and node not in before.twins:
             return ReleaseReport(bus.options, waits)
         nodeid = await _find(bus, node, before, force=force, listen_s=listen_s)
@@ -100,10 +100,6 @@ async def release(
     expected = uuid or (node if isinstance(node, Uuid) else None)
     returned = await _returned(bus, nodeid, expected, before)
     return ReleaseReport(bus.options, returned, nodeid)
-
-
-def _waiting(discovery: DiscoveredNodes, uuid: Uuid) -> WaitingNode | None:
-    return next((node for node in discovery.waiting if node.uuid == uuid), None)
 
 
 async def _find(bus: BusTalk, uuid: Uuid, discovery: DiscoveredNodes, *, force: bool, listen_s: float) -> int:

@@ -103,7 +103,7 @@ def test_a_node_that_goes_off_the_bus_while_it_is_asked(stage: CanStage, can_too
     with stage.user(count):
         said = examine(can_tool)
     finding = expect(said, "node-went-silent")["node-went-silent"]
-    assert finding["seen"].startswith(f"node {MAIN_ID} said what it is, and then answered no more: ")
+    assert finding["seen"].startswith(f"node {MAIN_ID} answered its first queries, but no further ones: ")
     assert "bus-off" in finding["means"]
 
 
