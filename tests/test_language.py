@@ -56,6 +56,13 @@ RETIRED = {
     "ConfigView": "config_view",
     "set_in_time": "set_target",
     "add_timed": "nothing: outputs have queue slots of their own",
+    "ThisComputer": "Computer",
+    "BusAddress": "BusOptions",
+    "TalkBus": "BusTalk",
+    "TableTalk": "NodeTables",
+    "by_nodeid": "nodeid",
+    "end_of_calm": "start_of_queries",
+    "release_on": "release",
 }
 """By the name that is refused: what to write instead."""
 SEARCHED = ("coordinator", "nodes", "canbus_tools", "tests", "bench", "docs", "README.md", "CONTRIBUTING.md")

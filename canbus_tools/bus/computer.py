@@ -1,6 +1,6 @@
-"""What the tools need of the computer they run on: its time, its CAN buses and its serial lines.
+"""The computer on which tools run: its time, CAN buses and serial lines.
 
-`ThisComputer` is the real one; a simulation takes its place with virtual time and simulated wires.
+Simulations derive from ``Computer``, with virtual time and simulated wires.
 """
 
 import asyncio
@@ -24,103 +24,63 @@ from nodes.transport.virtual import VirtualTransport
 T = TypeVar("T")
 
 
-class StartIO(Protocol):
-    """Starts the links of an open port, in the running event loop; parameters as of ``LinkIO``."""
-
-    def __call__(  # noqa: D102
-        self, *, on_frame: OnFrame | None = None, on_closed: Callable[[str], None] | None = None
-    ) -> LinkIO: ...
-
-
 @dataclass(frozen=True, slots=True)
 class Port:
     """An open CAN interface or serial line, for the project's own links."""
 
     name: str
-    """For messages."""
-    start_io: StartIO
+    """Name in messages."""
+    start_io: Callable[..., LinkIO]
+    """Start its I/O in the running event loop; takes on_frame and on_closed as ``LinkIO`` does."""
     close: Callable[[], None]
     """Release the device, after the I/O was closed; a backend of python-can may take seconds."""
 
 
 class Listener(Protocol):
-    """Collects all frames of a bus, with the Unix times at which they came."""
+    """Receives all frames of a bus, with the Unix times of their arrival."""
 
     @property
     def dropped(self) -> int:
-        """How many frames found no room."""
+        """Number of frames dropped for lack of room."""
 
     def take(self, timeout_s: float = 0.0) -> list[Frame]:
-        """Return all frames that wait, after at most TIMEOUT_S for the first one.
+        """Return all waiting frames; waits for the first one for at most TIMEOUT_S.
 
-        Raises CanductorError when the bus has failed, once its last frames were returned.
+        Raises CanductorError when the bus has failed and all its frames were returned.
         """
 
     def rest(self, quiet_s: float, limit_s: float) -> list[Frame]:
-        """Stop listening once nothing comes for QUIET_S, or after LIMIT_S; return all frames that waited.
+        """Stop listening when no frame comes for QUIET_S, or after LIMIT_S; return all waiting frames.
 
         Raises CanductorError as ``take`` does.
         """
 
     def only(self, can_id: int) -> None:
-        """Receive nothing but frames with this 11-bit id, and error reports, from now on."""
+        """Receive only frames with this 11-bit id and error reports from now on."""
 
 
 class FrameLine(Protocol):
-    """A bus for frames that belong to no node."""
+    """A bus for single frames, without links."""
 
     def send(self, frame: CanFrame) -> None:
         """Send FRAME; raises CanductorError."""
 
     def receive(self, timeout_s: float) -> CanFrame | None:
-        """Return the next data frame with an 11-bit id, None after the timeout; raises CanductorError."""
+        """Return the next data frame with an 11-bit id, or None after the timeout; raises CanductorError."""
 
     def close(self) -> None:
         """Release the bus."""
 
 
-class Computer(Protocol):
-    """Time, buses and serial lines. All that opens something raises CanductorError when it cannot."""
+class Computer:
+    """Time, buses and serial lines of this computer; methods that open a device raise CanductorError."""
 
     def monotonic_ns(self) -> int:
-        """Return the time that links and event loops count by (HostTime)."""
-
-    def unix_s(self) -> float:
-        """Return the Unix time, which frames are stamped with."""
-
-    def sleep(self, seconds: float) -> None:
-        """Wait."""
-
-    def run(self, main: Coroutine[Any, Any, T]) -> T:
-        """Run MAIN in an event loop of its own."""
-
-    def open_can(self, options: BusOptions) -> Port:
-        """Open a bus for links."""
-
-    def open_uart(self, path: str | Path, baud: int) -> Port:
-        """Open a serial line for a link."""
-
-    def open_frames(self, options: BusOptions) -> FrameLine:
-        """Open a bus for single frames."""
-
-    def listen(self, options: BusOptions, limit: int = FRAMES_MAX) -> AbstractContextManager[Listener]:
-        """Listen on a bus; when LIMIT frames wait, the oldest ones are dropped."""
-
-
-def now_s(computer: Computer) -> float:
-    """Return COMPUTER's monotonic time in s."""
-    return computer.monotonic_ns() * 1e-9
-
-
-class ThisComputer:
-    """The real computer: its clocks, asyncio, SocketCAN, the virtual bus, python-can and device files."""
-
-    def monotonic_ns(self) -> int:
-        """Return CLOCK_MONOTONIC."""
+        """Return the time of links and event loops (HostTime, CLOCK_MONOTONIC)."""
         return time.monotonic_ns()
 
     def unix_s(self) -> float:
-        """Return the Unix time."""
+        """Return the Unix time, with which frames are stamped."""
         return time.time()
 
     def sleep(self, seconds: float) -> None:
@@ -128,24 +88,29 @@ class ThisComputer:
         time.sleep(seconds)
 
     def run(self, main: Coroutine[Any, Any, T]) -> T:
-        """Run MAIN by asyncio."""
+        """Run MAIN in an event loop of its own."""
         return asyncio.run(main)
 
     def open_can(self, options: BusOptions) -> Port:
-        """Open a bus natively where that is possible, else by python-can."""
+        """Open a bus for links: natively if possible, else by python-can."""
         return _port(_open_transport(options))
 
     def open_uart(self, path: str | Path, baud: int) -> Port:
-        """Open a device file for this program alone."""
+        """Open a device file for a link, for this program alone."""
         return _port(open_uart(path, baud))
 
     def open_frames(self, options: BusOptions) -> FrameLine:
-        """Open a bus as ``open_can`` does."""
+        """Open a bus for single frames, as ``open_can`` does."""
         return _open_transport(options)
 
-    def listen(self, options: BusOptions, limit: int = FRAMES_MAX) -> FrameQueue:
-        """Listen by python-can, in a thread."""
+    def listen(self, options: BusOptions, limit: int = FRAMES_MAX) -> AbstractContextManager[Listener]:
+        """Listen on a bus, by python-can in a thread; beyond LIMIT waiting frames the oldest are dropped."""
         return FrameQueue(open_bus(options), options, limit=limit)
+
+
+def now_s(computer: Computer) -> float:
+    """Return COMPUTER's monotonic time in s."""
+    return computer.monotonic_ns() * 1e-9
 
 
 def _open_transport(options: BusOptions) -> CanTransport:

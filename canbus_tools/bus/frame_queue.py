@@ -1,11 +1,10 @@
-"""Takes frames off a bus in a thread of its own, so that nothing is missed while something else is done."""
+"""Receives the frames of a bus in a thread of its own, so that none is missed."""
 
 import contextlib
 import socket
 import threading
 import time
 from collections import deque
-from types import TracebackType
 from typing import Final, Self
 
 import can
@@ -15,17 +14,17 @@ from canbus_tools.protocol.frame import Frame
 from nodes.support.errors import CanductorError
 
 FRAMES_MAX: Final = 100_000
-"""Frames that wait: twelve seconds of a full bus at 1 Mbit/s."""
+"""Waiting frames: twelve seconds of a fully loaded bus at 1 Mbit/s."""
 RECEIVE_BUFFER_BYTES: Final = 4 << 20
-"""Asked of the kernel, which may grant less."""
+"""Requested from the kernel, which may grant less."""
 _POLL_S: Final = 0.1
-"""How often the thread looks whether it shall end: backends cannot be woken."""
+"""Interval at which the thread checks whether to end, as backends cannot be woken."""
 
 
 class FrameQueue:
-    """Receives from BUS, opened with OPTIONS, which becomes its own. A context manager.
+    """A Listener on BUS, which was opened with OPTIONS and which it closes. A context manager.
 
-    When LIMIT frames wait, the oldest ones give way and are counted in ``dropped``.
+    When LIMIT frames wait, the oldest ones are dropped and counted in ``dropped``.
     """
 
     def __init__(self, bus: can.BusABC, options: BusOptions, *, limit: int = FRAMES_MAX) -> None:
@@ -44,18 +43,13 @@ class FrameQueue:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ending = True
         self._thread.join()
         self._bus.shutdown()
 
     def take(self, timeout_s: float = 0.0) -> list[Frame]:
-        """Return all frames that wait, after at most TIMEOUT_S for the first one.
-
-        Raises CanductorError when the bus has failed, once its last frames were returned.
-        """
+        """Do as ``Listener.take``."""
         with self._changed:
             if not self._waiting and self._cause is None and timeout_s > 0:
                 self._changed.wait(timeout_s)
@@ -66,7 +60,7 @@ class FrameQueue:
         return frames
 
     def rest(self, quiet_s: float, limit_s: float) -> list[Frame]:
-        """Stop listening once nothing comes for QUIET_S, or after LIMIT_S; return all frames that waited."""
+        """Do as ``Listener.rest``."""
         self._ending = True
         self._thread.join()
         end_s = time.monotonic() + limit_s
@@ -75,7 +69,7 @@ class FrameQueue:
         return self.take()
 
     def only(self, can_id: int) -> None:
-        """Receive nothing but frames with this 11-bit id, and error reports, from now on."""
+        """Do as ``Listener.only``."""
         self._bus.set_filters([can.typechecking.CanFilter(can_id=can_id, can_mask=0x7FF, extended=False)])
 
     def _run(self) -> None:
@@ -83,16 +77,16 @@ class FrameQueue:
             self._receive(_POLL_S)
 
     def _receive(self, timeout_s: float) -> bool:
-        """Take one frame off the bus; return whether there was one."""
+        """Receive a frame; return whether there was one."""
         try:
             message = self._bus.recv(timeout_s)
-        # Whatever a backend raises ends the reception, and the user is told.
+        # Whatever a backend raises ends the reception and is reported.
         except Exception as error:  # noqa: BLE001
             said = " ".join(str(error).split()) or type(error).__name__
             with self._changed:
                 self._cause = CanductorError(
-                    f"CAN bus {self._options.name}: it cannot be listened to any more: {said}; "
-                    f"'canductor can doctor' may say why"
+                    f"CAN bus {self._options.name}: receiving failed: {said}; check the bus with "
+                    f"'canductor can doctor {self._options.arguments}'"
                 )
                 self._changed.notify()
             return False
@@ -111,7 +105,7 @@ class FrameQueue:
 
 
 def _ask_for_room(bus: can.BusABC) -> None:
-    """Let the kernel hold more of a socket's frames; other backends have buffers of their own."""
+    """Enlarge the kernel's buffer of a socket; other backends have buffers of their own."""
     found = getattr(bus, "socket", None)
     if isinstance(found, socket.socket):
         with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
-"""Opening the CAN bus that a tool works on, with the options python-can's own tools have."""
+"""Opening the CAN bus of a tool, with the same options as python-can's own tools."""
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import can
@@ -14,29 +14,43 @@ BITRATE_MIN, BITRATE_MAX = 10_000, 1_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusOptions:
-    """Which bus."""
+    """A CAN bus, and how to open it."""
 
     interface: str = "socketcan"
-    """A backend of python-can; ``canductor``: the project's virtual bus, CHANNEL is its socket."""
+    """Backend of python-can; ``canductor``: the project's virtual bus, with its socket as CHANNEL."""
     channel: str = "can0"
     bitrate: int | None = None
-    """Bit/s; None: as the interface is set."""
+    """Bit/s; None: that of the interface."""
     listen_only: bool = False
-    """Never disturb the bus, not even by an acknowledgement; only some adapters can."""
+    """Whether to send nothing, not even acknowledgements; only some adapters support it."""
 
     @property
     def short_name(self) -> str:
-        """How a bus is called in recordings and lines: of a path, the last part."""
+        """Name in recordings and lines: the last part of a path."""
         return self.channel.rpartition("/")[2] or self.channel
 
     @property
     def name(self) -> str:
-        """How messages call the bus."""
-        return self.channel if self.interface == "socketcan" else f"{self.interface}:{self.channel}"
+        """Name in messages."""
+        return self.channel if self.is_socketcan else f"{self.interface}:{self.channel}"
+
+    @property
+    def is_socketcan(self) -> bool:
+        """Whether it is a network interface of Linux."""
+        return self.interface == "socketcan"
+
+    @property
+    def arguments(self) -> str:
+        """The bus as options of a command line: ``-c can0``."""
+        return f"{'' if self.is_socketcan else f'-i {self.interface} '}-c {self.channel}"
+
+    def without_bitrate(self) -> "BusOptions":
+        """Return the same without the bit rate if only the system can set that."""
+        return replace(self, bitrate=None) if self.interface in ("socketcan", "canductor") else self
 
 
 def declare_bus(command: argparse.ArgumentParser) -> None:
-    """Add the options that say which bus."""
+    """Add the options that select the bus."""
     add = command.add_argument
     add("-i", "--interface", default="socketcan", help="backend of python-can (default: %(default)s)")
     add("-c", "--channel", help="channel of the backend (default: can0)")
@@ -57,7 +71,7 @@ def bus_options(given: argparse.Namespace) -> BusOptions:
 
 
 def open_bus(options: BusOptions) -> can.BusABC:
-    """Open the bus; raises CanductorError with what failed and what to do."""
+    """Open the bus; raises CanductorError with the cause and what to do."""
     extra: dict[str, Any] = {} if options.bitrate is None else {"bitrate": options.bitrate}
     if options.listen_only and options.interface not in ("socketcan", "canductor"):
         extra["listen_only"] = True
@@ -75,14 +89,14 @@ def _why(options: BusOptions, error: Exception) -> str:
     if options.interface == "socketcan":
         if "No such device" in said:
             return (
-                f"there is no such interface; 'ip -details link show type can' lists those there are, and"
-                f" 'canductor can doctor -c {options.channel}' says more"
+                "there is no such interface; 'ip -details link show type can' lists all CAN interfaces, and "
+                f"'canductor can doctor -c {options.channel}' checks this one"
             )
         if "Address family not supported" in said:
-            return "this kernel has no CAN; load the module can-raw: 'modprobe can-raw'"
+            return "this kernel has no support for CAN; load the module: 'modprobe can-raw'"
         if "Operation not permitted" in said or "Permission denied" in said:
             return f"opening it is not permitted ({said})"
     return (
-        f"python-can cannot open it ({said}); its backends and their channels are named at"
-        " python-can.readthedocs.io/en/stable/interfaces.html, and some need a driver"
+        f"python-can cannot open it ({said}); python-can.readthedocs.io/en/stable/interfaces.html describes "
+        "its backends and their channels; some need a driver"
     )

@@ -63,7 +63,7 @@ class Quantity(NamedTuple):
 
 
 def is_name(text: str) -> bool:
-    """Tell whether something can be called TEXT in an expression."""
+    """Return whether TEXT is a valid name in an expression."""
     return bool(_NAME.fullmatch(text)) and text not in UNITS and text not in _FUNCTIONS
 
 
@@ -200,4 +200,4 @@ _FUNCTIONS: Final[Mapping[str, tuple[int, Callable[[list[Quantity]], Quantity]]]
     "floor": (1, lambda of: Quantity(Fraction(of[0].value // 1), of[0].clocks)),
     "ceil": (1, lambda of: Quantity(Fraction(-(-of[0].value // 1)), of[0].clocks)),
 }
-"""By name: how many values at least (1: exactly one), and what becomes of them."""
+"""By name: the least number of values (1: exactly one) and the function."""

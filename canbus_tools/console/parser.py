@@ -18,9 +18,9 @@ OWN: Final[Mapping[str, tuple[str, str]]] = {
     "/stats": ("", "counters of the link: round trips, repeats, invalid bytes"),
     "/repeat": ("N [INTERVAL] COMMAND", "send a command N times, every INTERVAL (50ms, 2s)"),
     "/delay": ("TIME", "wait (50ms, 2s)"),
-    "/set": ("NAME EXPRESSION", "call a value NAME from now on; without words: show all names"),
-    "/eval": ("EXPRESSION", "show what an expression gives"),
-    "/hide": ("[NAME …]", "do not show these messages when they come unasked; without names: show all"),
+    "/set": ("NAME EXPRESSION", "define NAME as a value; without arguments: show all names"),
+    "/eval": ("EXPRESSION", "show the value of an expression"),
+    "/hide": ("[NAME …]", "hide these messages unless they answer a command; without names: show all"),
     "/quit": ("", "end; so does Ctrl-D"),
 }
 """The console's own commands: what they take, and what they do."""
@@ -217,7 +217,7 @@ def answer_to(dictionary: Dictionary, name: str) -> str | None:
 
 
 def may_repeat(name: str) -> bool:
-    """Tell whether a command only asks, and so can be sent again when its answer got lost."""
+    """Return whether a command is only a query, which can be repeated when its answer got lost."""
     return name == "identify" or bool(_QUERY_WORDS.intersection(name.split("_")))
 
 

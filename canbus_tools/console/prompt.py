@@ -19,7 +19,7 @@ from canbus_tools.console.session import Quit, Session
 from nodes.support.errors import CanductorError
 
 HISTORY_BYTES_MAX: Final = 1 << 20
-"""A longer history is begun anew; the old one is kept beside it."""
+"""A longer history is moved to a second file, and a new one is started."""
 
 
 class SessionCompleter(Completer):

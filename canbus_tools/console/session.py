@@ -33,6 +33,10 @@ LIST_MAX: Final = 200
 ONLY_ONCE_S: Final = 1.5
 """How long the answer to a command is waited for that must not be sent twice."""
 _CLOCKS: Final = (("get_uptime", "uptime"), ("get_clock", "clock"))
+_COUNTERS: Final = (
+    *("commands_sent", "blocks_sent", "bytes_sent", "blocks_repeated", "naks", "timeouts"),
+    *("blocks_received", "bytes_received", "bytes_invalid"),
+)
 _PER_S: Final = 1_000_000_000
 
 
@@ -41,7 +45,7 @@ class Quit(Exception):  # noqa: N818 (no failure)
 
 
 class Session:
-    """Carries out lines on a conversation with a node; SAY gets each line of output.
+    """Executes lines on a connection to a node; SAY receives each line of output.
 
     With AS_JSON each message is one JSON object in a line. Use from one event loop.
     """
@@ -90,7 +94,7 @@ class Session:
         self._asked = _text_of(command)
         try:
             if answer is None:
-                self.talk.send(command.name, values)
+                self.talk.link.send(self.talk.encode(command.name, **values))
                 await self.talk.drained()
             elif may_repeat(command.name):
                 await self.talk.ask(command.name, answer, values)
@@ -147,7 +151,7 @@ class Session:
         freq_hz = frequency_hz(self.dictionary)
         known = next(((ask, says) for ask, says in _CLOCKS if self.talk.knows(ask, says)), None)
         if known is None or freq_hz is None:
-            raise ConsoleError("the node's firmware does not tell its clock, so 'clock' has no value")
+            raise ConsoleError("the node's firmware does not report its clock, so 'clock' has no value")
         self._own_question = known[1]
         try:
             answer = await self.talk.ask(*known)
@@ -222,16 +226,8 @@ class Session:
             f"received {stats.blocks_received} blocks ({stats.bytes_received} bytes); "
             f"{stats.bytes_invalid} bytes invalid, {self.talk.undecodable} responses unknown\n"
             f"round trip {stats.srtt_s * 1000:.2f} ms, spread {stats.rttvar_s * 1000:.2f} ms",
-            stats={
-                "commands_sent": stats.commands_sent,
-                "blocks_sent": stats.blocks_sent,
-                "bytes_sent": stats.bytes_sent,
-                "blocks_repeated": stats.blocks_repeated,
-                "naks": stats.naks,
-                "timeouts": stats.timeouts,
-                "blocks_received": stats.blocks_received,
-                "bytes_received": stats.bytes_received,
-                "bytes_invalid": stats.bytes_invalid,
+            stats={name: getattr(stats, name) for name in _COUNTERS}
+            | {
                 "undecodable": self.talk.undecodable,
                 "round_trip_s": stats.srtt_s,
                 "round_trip_spread_s": stats.rttvar_s,

@@ -1,9 +1,8 @@
-"""Runs node discovery on an open bus; options common to the tools that ask nodes."""
+"""Runs node discovery on an open bus; the option common to the tools that query nodes."""
 
 import argparse
 from typing import Final
 
-from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
 from canbus_tools.discovery.node_discovery import ROUNDS, DiscoveredNodes, NodeDiscovery
 from nodes.link import Frame
@@ -12,13 +11,13 @@ from nodes.support.errors import CanductorError
 from nodes.support.option_values import decimal
 
 _CAUSE_S: Final = 0.2
-"""The sentence why a bus ended comes from another thread, maybe a little after sending fails."""
+"""The cause of a bus's end is reported by another thread, perhaps shortly after sending fails."""
 _LISTEN_MIN_S: Final = 0.1
 _LISTEN_MAX_S: Final = 60.0
 
 
 async def discover_nodes(bus: BusTalk, rounds: int = ROUNDS) -> DiscoveredNodes:
-    """Ask who is on BUS, ROUNDS times or more; raises CanductorError when the bus cannot be used."""
+    """Query which nodes are on BUS, at least ROUNDS times; raises CanductorError if the bus fails."""
     discovery = NodeDiscovery(rounds)
 
     def came(frame: Frame) -> None:
@@ -29,8 +28,7 @@ async def discover_nodes(bus: BusTalk, rounds: int = ROUNDS) -> DiscoveredNodes:
     raise_later: list[CanductorError] = []
     end = bus.on_frame(came)
     try:
-        # By a clock of its own, of the time that was waited: what this computer overslept beyond that, the
-        # nodes' answers may have had to wait, too.
+        # A clock that counts only the time waited: while this computer was late, answers may have been, too.
         now_ns = 0
         discovery.start(now_ns)
         while discovery.deadline_ns is not None and not raise_later:
@@ -38,7 +36,7 @@ async def discover_nodes(bus: BusTalk, rounds: int = ROUNDS) -> DiscoveredNodes:
                 for frame in discovery.frames_to_send():
                     bus.send_frame(frame.can_id, frame.data)
             except CanductorError:
-                await bus.wait(_CAUSE_S)  # which raises what ended the bus, and that tells more
+                await bus.wait(_CAUSE_S)  # raises the cause, if the bus has ended
                 raise
             await bus.wait((discovery.deadline_ns - now_ns) * 1e-9)
             now_ns = discovery.deadline_ns
@@ -51,26 +49,20 @@ async def discover_nodes(bus: BusTalk, rounds: int = ROUNDS) -> DiscoveredNodes:
 
 
 def bus_off(bus: str) -> CanductorError:
-    """Return what to say when the adapter took itself off the bus."""
+    """Return the error for an adapter that is bus-off."""
     return CanductorError(
-        f"the controller of {bus} met too many errors and went off the bus (bus-off): most often the bit "
-        f"rate is not the nodes', or a cable or the termination is at fault; 'canductor can doctor -c {bus}' "
-        f"checks, 'ip link set {bus} down' and 'ip link set {bus} up' bring it back"
+        f"the controller of {bus} detected too many errors and left the bus (bus-off); usual causes are a "
+        "bit rate other than the nodes', a cable or the termination: check with 'canductor can doctor -c "
+        f"{bus}', then restart it with 'ip link set {bus} down' and 'ip link set {bus} up'"
     )
 
 
 def declare_listen(command: argparse.ArgumentParser) -> None:
-    """Add the option ``listen``: how long to listen for other hosts, in seconds."""
+    """Add the option ``listen``: time to listen for other hosts, in seconds."""
     command.add_argument(
         "--listen",
         type=decimal(_LISTEN_MIN_S, _LISTEN_MAX_S, "s"),
         metavar="S",
         default=LISTEN_S,
-        help="how long to listen for other hosts first, in seconds",
+        help="time to listen for other hosts before sending, in seconds",
     )
-
-
-def where(options: BusOptions) -> str:
-    """Return the options of a command line that name the bus."""
-    interface = "" if options.interface == "socketcan" else f"-i {options.interface} "
-    return f"{interface}-c {options.channel}"

@@ -1,6 +1,6 @@
-"""What a coordinator that runs on this computer says of the nodes that it drives, asked over its socket.
+"""Queries the coordinators that run on this computer for the nodes that they drive.
 
-Its interface is specified in docs/ipc.md; this uses the form that is made for scripts: lines of JSON.
+Uses their socket and the encoding for scripts, lines of JSON (docs/ipc.md).
 """
 
 import asyncio
@@ -24,9 +24,9 @@ _REQUESTS: Final = (
 
 
 async def ask_hosts(options: BusOptions, timeout_s: float = TIMEOUT_S) -> dict[int, NodeInfo]:
-    """Return what this user's coordinators say of their nodes on a bus, by id; nothing where none runs.
+    """Return what this user's coordinators report about their nodes on a bus, by node id.
 
-    One that says nothing is waited for TIMEOUT_S.
+    Waits for at most TIMEOUT_S.
     """
     answers = await asyncio.gather(*(_ask(path, timeout_s) for path in host_sockets()))
     bus = _bus_name(options)
@@ -39,7 +39,7 @@ async def ask_hosts(options: BusOptions, timeout_s: float = TIMEOUT_S) -> dict[i
 
 
 def _bus_name(options: BusOptions) -> str:
-    """Return how a coordinator's configuration calls the bus."""
+    """Return the name of the bus in a coordinator's configuration."""
     if options.interface == "socketcan":
         return options.channel
     interface = "virtual" if options.interface == "canductor" else options.interface
@@ -47,7 +47,7 @@ def _bus_name(options: BusOptions) -> str:
 
 
 async def _ask(path: Path, timeout_s: float) -> list[object]:
-    """Return the nodes that the coordinator at PATH lists; none when there is no sense to be had from it."""
+    """Return the nodes that the coordinator at PATH lists; none if there is no valid answer."""
     try:
         async with asyncio.timeout(timeout_s):
             reader, writer = await asyncio.open_unix_connection(path, limit=LINE_MAX)
@@ -59,7 +59,7 @@ async def _ask(path: Path, timeout_s: float) -> list[object]:
                         return list(answer["result"]["nodes"])
             finally:
                 writer.close()
-    # A socket that nobody serves any more, or a program that speaks otherwise: then nobody is there to ask.
+    # The socket is stale, or belongs to another program.
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return []
     return []

@@ -1,8 +1,8 @@
 """Everything alive on a bus, with an id or without, and what it is.
 
-First only listened: ids to which another host sends something belong to that host, and nothing is sent there.
-The nodes on all other ids are found by a damaged block: by the protocol a node answers one with its number of
-the next block, executes nothing and changes nothing. Those that answer are asked who they are.
+It listens first: ids to which another host sends belong to that host, and nothing is sent to them. Nodes on
+all other ids are found by a damaged block: a node answers it with the number of the next block that it
+expects, executes nothing and changes nothing. Nodes that answer are queried.
 """
 
 import asyncio
@@ -12,49 +12,49 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final
 
-from canbus_tools.bus.open_bus import BusOptions
-from canbus_tools.bus.talk import DATA_IDS, LISTEN_S, BusTalk, data_ids
+from canbus_tools.bus.talk import LISTEN_S, BusTalk
 from canbus_tools.discovery.ask_bus import discover_nodes
 from canbus_tools.discovery.ask_host import ask_hosts
 from canbus_tools.discovery.node_discovery import ROUNDS, Application, DiscoveredNodes, NodeHere, WaitingNode
 from canbus_tools.discovery.node_info import NodeInfo, read_node_info
 from canbus_tools.discovery.passive_discovery import PassiveDiscovery
+from canbus_tools.protocol.protocol import Direction, data_id, owner_of
 from nodes.bus.assign import Uuid
 from nodes.link import Frame
 from nodes.support.can_protocol import FIRST_NODEID
 from nodes.support.errors import CanductorError
 
 PROBED: Final = range(FIRST_NODEID, 68)
-"""Hosts hand out 4, 5, 6, …; ids beyond are tried when something was heard from them, or when asked for."""
+"""Hosts assign 4, 5, 6, …; higher ids are tried if they were heard, or on request."""
 DAMAGED_BLOCK: Final = b"\x05\x10\x00\x00\x7e\x7e"
-"""An empty block with a wrong checksum; the second sync byte ends it for parsers that look for one behind."""
+"""An empty block with a wrong checksum; the second sync byte is for parsers that search for the next one."""
 PROBE_PASSES: Final = 3
-"""Frames get lost; of nodes that discovery did not find one answer is all there is."""
+"""Attempts, as frames get lost; without discovery, one answer is the only sign of a node."""
 PROBES_AT_ONCE: Final = 4
 PROBE_PAUSE_S: Final = 0.002
-"""Between so many: a fifth of the bus at 1 Mbit/s, all of it for 40 ms at 250 kbit/s."""
+"""Pause after so many: uses a fifth of the bus at 1 Mbit/s, all of it for 40 ms at 250 kbit/s."""
 PROBE_ANSWER_S: Final = 0.03
-"""For the last answers; adapters on USB may hold frames back for 16 ms."""
+"""Time for the last answers; adapters on USB may delay frames by 16 ms."""
 READ_AT_ONCE: Final = 8
 HEAR_OUT_S: Final = 0.1
 HEAR_OUT_TIMES: Final = 22
-"""At most so often: a host that asks for clocks every 0.98 s has asked three times since the beginning."""
+"""A host that queries clocks every 0.98 s has then done so three times since the start."""
 
 
 class NodePresence(Enum):
-    """What a node is doing, as far as can be told."""
+    """State of a node, as far as it is known."""
 
     WAITING = "waiting"
     BOOTLOADER = "bootloader"
     IN_USE = "in use"
-    """Another host talks to it, so it was not asked."""
+    """Another host uses it, so it was not queried."""
     IDLE = "idle"
     """It has an id and no configuration."""
     CONFIGURED = "configured"
-    """It has a configuration, and no host that talks to it."""
+    """It has a configuration, but no host uses it."""
     SHUTDOWN = "shutdown"
     UNCLEAR = "unclear"
-    """``trouble`` says why."""
+    """``trouble`` has the reason."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,15 +69,15 @@ class InventoryEntry:
     twins: bool = False
     """Another board has the same uuid."""
     told: NodeInfo | None = None
-    """Of a node in use: what the coordinator says that drives it."""
+    """Of a node in use: what its coordinator reports."""
     passive: NodeInfo | None = None
-    """Of a node in use: what its traffic tells by a dictionary of the cache that explains it."""
+    """Of a node in use: what its traffic shows, by a dictionary in the cache that explains it."""
     trouble: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """All nodes that were found: by id, then those that wait."""
+    """All nodes that were found, by id, followed by those that wait for one."""
 
     entries: tuple[InventoryEntry, ...]
     discovery: DiscoveredNodes
@@ -86,7 +86,7 @@ class Inventory:
 
     @property
     def boards(self) -> int:
-        """How many there are at least: twins that answer alike are one entry."""
+        """Minimum number of boards: twins that answer identically are one entry."""
         rows = Counter(entry.uuid for entry in self.entries)
         return len(self.entries) + sum(entry.twins and rows[entry.uuid] == 1 for entry in self.entries)
 
@@ -94,15 +94,11 @@ class Inventory:
         """Return the nodes that have a uuid."""
         return [entry for entry in self.entries if entry.uuid == uuid]
 
-    def by_nodeid(self, nodeid: int) -> list[InventoryEntry]:
-        """Return the nodes that have an id."""
-        return [entry for entry in self.entries if entry.nodeid == nodeid]
-
 
 async def take_inventory(
     bus: BusTalk, *, probed: Iterable[int] = PROBED, listen_s: float = LISTEN_S, rounds: int = ROUNDS
 ) -> Inventory:
-    """Find all nodes on BUS, after listening for LISTEN_S; raises CanductorError when the bus fails."""
+    """Find all nodes on BUS, after listening for LISTEN_S; raises CanductorError if the bus fails."""
     started_s = asyncio.get_running_loop().time()
     discovery = await discover_nodes(bus, rounds)
     await bus.wait(max(0.0, started_s + listen_s - asyncio.get_running_loop().time()))
@@ -111,7 +107,7 @@ async def take_inventory(
     answering = await probe(bus, candidates)
     hosted = frozenset(bus.hosted)
     shared = _shared_ids(discovery)
-    # A node that answered WHO_IS_HERE is read even when no probe was answered: reading repeats questions.
+    # A node that answered WHO_IS_HERE is queried even if it answered no probe: queries are repeated.
     asked = sorted((answering | here) - hosted - shared)
     facts = dict(zip(asked, await _read_all_node_info(bus, asked), strict=True))
     silent = {n for n in here - answering if isinstance(facts.get(n), CanductorError)}
@@ -124,14 +120,14 @@ async def take_inventory(
 
 
 async def take_full_inventory(
-    bus: BusTalk, options: BusOptions, *, probed: Iterable[int], listen_s: float
+    bus: BusTalk, *, probed: Iterable[int] = PROBED, listen_s: float = LISTEN_S
 ) -> Inventory:
     """Find all nodes; of nodes in use, add what their host reports, or else what their traffic shows."""
     passive = PassiveDiscovery(bus.cache)
     end = bus.on_frame(passive.frame)
     try:
         found = await take_inventory(bus, probed=probed, listen_s=listen_s)
-        told = await ask_hosts(options)
+        told = await ask_hosts(bus.options)
         await _listen_out(bus, frozenset(bus.hosted - told.keys()), passive)
     finally:
         end()
@@ -140,7 +136,7 @@ async def take_full_inventory(
 
 
 async def _listen_out(bus: BusTalk, hosted: Iterable[int], passive: PassiveDiscovery) -> None:
-    """Wait for a node's second word about its clock where that may tell what it is."""
+    """Wait for a second clock report of a node if that may identify it."""
     for _ in range(HEAR_OUT_TIMES):
         if not any(passive.is_open(nodeid) for nodeid in hosted):
             return
@@ -160,9 +156,9 @@ def _in_use(entry: InventoryEntry, told: Mapping[int, NodeInfo], passive: Passiv
 async def _still_waiting(
     bus: BusTalk, discovery: DiscoveredNodes, with_id: Collection[Uuid | None]
 ) -> Iterable[WaitingNode]:
-    """Return who waits; of a uuid that was found with an id as well, only when it still does: a second board.
+    """Return the waiting nodes, without boards to which another host has assigned an id meanwhile.
 
-    Else another host gave the board its id meanwhile.
+    A uuid that was also found with an id must still wait: then it belongs to a second board.
     """
     if not any(node.uuid in with_id for node in discovery.waiting):
         return discovery.waiting
@@ -171,13 +167,14 @@ async def _still_waiting(
 
 
 async def probe(bus: BusTalk, nodeids: Iterable[int]) -> set[int]:
-    """Send a damaged block to each of NODEIDS to whom no other host talks; return those that answered."""
+    """Send a damaged block to each of NODEIDS that no other host uses; return those that answered."""
     wanted = set(nodeids)
     answered: set[int] = set()
 
     def came(frame: Frame) -> None:
-        if frame.can_id in DATA_IDS and frame.can_id % 2:
-            answered.add((frame.can_id - 0x101) // 2)
+        owner = owner_of(frame.can_id)
+        if owner is not None and owner[1] is Direction.FROM_NODE:
+            answered.add(owner[0])
 
     end = bus.on_frame(came)
     try:
@@ -186,7 +183,7 @@ async def probe(bus: BusTalk, nodeids: Iterable[int]) -> set[int]:
                 if number % PROBES_AT_ONCE == 0:
                     await bus.wait(PROBE_PAUSE_S)
                 if nodeid not in bus.hosted:
-                    bus.send_frame(data_ids(nodeid)[0], DAMAGED_BLOCK)
+                    bus.send_frame(data_id(nodeid, Direction.TO_NODE), DAMAGED_BLOCK)
             await bus.wait(PROBE_ANSWER_S)
     finally:
         end()
@@ -194,7 +191,7 @@ async def probe(bus: BusTalk, nodeids: Iterable[int]) -> set[int]:
 
 
 async def _read_all_node_info(bus: BusTalk, nodeids: list[int]) -> list[NodeInfo | CanductorError]:
-    """Ask them all, a few at a time, beside a host one at a time; what went wrong with one is its result."""
+    """Query all, a few at a time, or one at a time if a host uses the bus; a failure is a node's result."""
     room = asyncio.Semaphore(1 if bus.hosted else READ_AT_ONCE)
 
     async def one(nodeid: int) -> NodeInfo | CanductorError:
@@ -211,7 +208,7 @@ async def _read_all_node_info(bus: BusTalk, nodeids: list[int]) -> list[NodeInfo
 
 
 def _shared_ids(discovery: DiscoveredNodes) -> frozenset[int]:
-    """Return the ids that more than one board has: their answers would be a mixture."""
+    """Return the ids that more than one board has; their answers would be mixed up."""
     boards = Counter(node.nodeid for node in discovery.here)
     twins = {node.nodeid for node in discovery.here if node.twins}
     return frozenset(twins | {nodeid for nodeid, count in boards.items() if count > 1})
@@ -224,17 +221,18 @@ def _assigned(
     application = Application.CANDUCTOR if ours else Application.KLIPPER
     if isinstance(said, CanductorError):
         uuid = ours.uuid if ours else None
-        trouble = "it says that it is here, but does not answer on its id" if silent else str(said)
+        trouble = "it reports its presence, but does not answer on its id" if silent else str(said)
         return InventoryEntry(
             nodeid=nodeid, uuid=uuid, application=application, state=NodePresence.UNCLEAR, trouble=trouble
         )
     uuid = said.uuid or (ours.uuid if ours else None)
-    trouble = "" if said.configured is not None else "its firmware does not tell whether it is configured"
+    trouble = "" if said.configured is not None else "its firmware does not report whether it is configured"
     if said.believed_nodeid not in (None, nodeid):
-        trouble = f"it answers on id {nodeid}, but says that it has id {said.believed_nodeid}"
+        trouble = f"it answers on id {nodeid}, but reports the id {said.believed_nodeid}"
     elif ours and uuid != ours.uuid:
         trouble = (
-            f"two boards answer on this id: {ours.uuid} and {uuid}; power both off, and let one host assign"
+            f"two boards answer on this id: {ours.uuid} and {uuid}; switch both off and on, and let only one "
+            "host assign ids"
         )
     return InventoryEntry(
         nodeid=nodeid, uuid=uuid, application=application, state=_state(said), facts=said, trouble=trouble
@@ -250,7 +248,7 @@ def _state(facts: NodeInfo) -> NodePresence:
 
 
 def _not_asked(node: NodeHere, shared: frozenset[int]) -> InventoryEntry:
-    """Our firmware that said that it is here, and has a host or shares its id."""
+    """Return a node with our firmware that has a host or shares its id."""
     both = "more than one board has this id; switch them off and on, and let only one host assign ids"
     is_shared = node.nodeid in shared
     return InventoryEntry(
@@ -264,8 +262,8 @@ def _not_asked(node: NodeHere, shared: frozenset[int]) -> InventoryEntry:
 
 
 def _hosted(nodeid: int, *, answers: bool) -> InventoryEntry:
-    """Return what is known of a node by its traffic alone. A host that could be asked would know more."""
-    silent = "another program sends to this id, and nobody answers"
+    """Return a node that is known only by its traffic."""
+    silent = "another program sends to this id, but no node answers"
     return InventoryEntry(
         nodeid=nodeid,
         uuid=None,

@@ -1,11 +1,11 @@
-"""Who is on a bus: the two questions that everybody may ask, repeated, and their answers merged. Sans-IO.
+"""Discovery of nodes: repeats the two broadcast queries and merges their answers. Sans-IO.
 
-A round asks WHO_IS_HERE (of our firmware, nodes with an id answer) and then QUERY_UNASSIGNED (all nodes
-without one answer). Neither changes anything in a node. One round is not enough: answers have the same CAN
-id, so two that begin in the same bit time destroy each other, and frames get lost.
+A round sends WHO_IS_HERE (answered by nodes with our firmware and an id) and then QUERY_UNASSIGNED (answered
+by all nodes without an id). Neither changes anything in a node. One round is not enough: answers have the
+same CAN id, so two that begin in the same bit time destroy each other, and frames get lost.
 
-Two boards with one uuid show by answering more often than they were asked. Boards that answer at the very
-same moment send the very same bits and look like one: firmware without a random wait hides its twin.
+Two boards with one uuid are detected as they answer more often than they were queried. Boards that answer at
+the same moment send the same bits and look like one, if their firmware does not wait for a random time.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
-from canbus_tools.bus.talk import DATA_IDS
+from canbus_tools.protocol.protocol import Direction, owner_of
 from nodes.bus.assign import ANSWER_NS, AdminFrame, Uuid
 from nodes.support.can_protocol import (
     ADMIN_ID,
@@ -29,27 +29,26 @@ from nodes.support.can_protocol import (
 
 ROUNDS: Final = 5
 ROUND_NS: Final = 40_000_000
-"""Nodes answer within milliseconds; adapters on USB may hold frames back for 16 ms."""
+"""Nodes answer within milliseconds; adapters on USB may delay frames by 16 ms."""
 LATE_NS: Final = 75_000_000
-"""How much longer a round may take when nobody answers, or fewer than before: on a busy computer all take
-their time."""
+"""Extension of a round without answers, or with fewer than before, for the case of a busy computer."""
 QUIET_ROUNDS: Final = 3
-"""It goes on until so many rounds brought nobody new …"""
+"""Number of rounds without a new node after which discovery ends."""
 ROUNDS_MAX: Final = 200
-"""… but ends even if new ones appear for ever."""
+"""Number of rounds after which it ends even if new nodes keep appearing."""
 MAX_UUIDS: Final = 512
-"""Remembered; a bus has at most 252 ids to give."""
+"""Most uuids remembered; a bus has 252 ids to assign."""
 
 
 class Application(Enum):
-    """What runs on a board, as far as it says."""
+    """Software on a board, as far as it reports it."""
 
     KLIPPER = "klipper-type"
-    """Firmware that speaks the protocol; ours too, as long as it has no id: then they answer alike."""
+    """Firmware with this protocol; includes ours while it has no id, as both then answer alike."""
     CANDUCTOR = "canductor"
     """This project's firmware."""
     KATAPULT = "katapult"
-    """Only its bootloader."""
+    """The bootloader."""
     UNKNOWN = "unknown"
 
 
@@ -84,7 +83,7 @@ class NodeHere:
 
 @dataclass(frozen=True, slots=True)
 class DiscoveredNodes:
-    """Who answered, in the order of uuids and ids, and what else was heard."""
+    """The nodes that answered, ordered by uuid or id, and other traffic."""
 
     waiting: tuple[WaitingNode, ...]
     here: tuple[NodeHere, ...]
@@ -111,8 +110,8 @@ class _Heard:
     """Answers to WHO_IS_HERE by node id."""
     last: int = 0
     changes: int = 0
-    """How often it had an id after it had none, or the other way round; one board may do that once, as
-    another host gives it its id, or resets it."""
+    """Number of changes between having an id and having none; one board may change once, as another host
+    assigns its id or resets it."""
 
     def says(self, what: int) -> None:
         self.changes += self.last not in (0, what)
@@ -120,10 +119,10 @@ class _Heard:
 
 
 class NodeDiscovery:
-    """Asks ROUNDS times or more. Times are nanoseconds of any one clock.
+    """Discovery in at least ROUNDS rounds. Times are nanoseconds of any one clock.
 
-    Call ``start``, then ``frame`` for what arrives and ``timer`` when ``deadline_ns`` has come; send what
-    ``frames_to_send`` returns after each; it is over when ``deadline_ns`` is None.
+    Call ``start``, then ``frame`` for every received frame and ``timer`` at ``deadline_ns``; send the
+    ``frames_to_send`` after each call; it ends when ``deadline_ns`` is None.
     """
 
     def __init__(self, rounds: int = ROUNDS) -> None:
@@ -140,33 +139,29 @@ class NodeDiscovery:
         self._talking: set[int] = set()
         self._foreign_frames = 0
         self.ignored = 0
-        """Answers that make no sense, or of more boards than can be remembered."""
+        """Number of invalid answers, or of answers from boards beyond MAX_UUIDS."""
         self.deadline_ns: int | None = None
 
-    def start(self, now_ns: int) -> None:
-        """Begin the first round."""
-        self._next_round(now_ns)
-
     def frames_to_send(self) -> list[AdminFrame]:
-        """Return what is to be sent now, once."""
+        """Return the frames to be sent now, once."""
         frames, self._outbox = self._outbox, []
         return frames
 
     def frame(self, can_id: int, data: bytes) -> None:
-        """Take a received frame, whatever it is."""
+        """Take any received frame."""
         if can_id == ADMIN_RESPONSE_ID:
             self._answer(data)
         elif can_id == ADMIN_ID:
-            # Another host asks too: the nodes answer both.
+            # A query of another host: nodes answer both.
             if data[:1] and data[0] in self._asked:
                 self._asked[data[0]] += 1
-        elif can_id in DATA_IDS:
-            (self._talking if can_id % 2 else self._hosted).add((can_id - 0x100) // 2)
+        elif owner := owner_of(can_id):
+            (self._hosted if owner[1] is Direction.TO_NODE else self._talking).add(owner[0])
         else:
             self._foreign_frames += 1
 
     def timer(self, now_ns: int) -> None:
-        """Take the time; begins the next round, or ends, when the deadline has come."""
+        """Start the next round, or end, if the deadline has come."""
         if self.deadline_ns is None or now_ns < self.deadline_ns:
             return
         if self._answers < self._answers_max and now_ns < self._latest_ns:
@@ -176,11 +171,11 @@ class NodeDiscovery:
         if enough or self._rounds >= max(ROUNDS_MAX, self._rounds_min):
             self.deadline_ns = None
         else:
-            self._next_round(now_ns)
+            self.start(now_ns)
 
     def result(self) -> DiscoveredNodes:
-        """Return what is known so far."""
-        # A board that was given its id meanwhile, or lost it, is what it said last; of twins all is told.
+        """Return the nodes found so far."""
+        # The last answer of a board counts, as ids are assigned and lost; of twins all answers count.
         waiting = [
             self._waiting(uuid, heard)
             for uuid, heard in self._heard.items()
@@ -203,7 +198,8 @@ class NodeDiscovery:
 
     # ----------------------------------------------------------------------------------------------- inside
 
-    def _next_round(self, now_ns: int) -> None:
+    def start(self, now_ns: int) -> None:
+        """Start a round."""
         self._rounds += 1
         self._quiet_rounds += 1
         for question in (WHO_IS_HERE, QUERY_UNASSIGNED):
@@ -235,7 +231,7 @@ class NodeDiscovery:
             heard.here[data[-1]] = heard.here.get(data[-1], 0) + 1
 
     def _has_twin(self, heard: _Heard) -> bool:
-        """Tell whether more than one board was heard: one answers each question once, and has one id."""
+        """Return whether more than one board was heard: one answers each query once, and has one id."""
         return (
             heard.answers > self._asked[QUERY_UNASSIGNED]
             or sum(heard.here.values()) > self._asked[WHO_IS_HERE]

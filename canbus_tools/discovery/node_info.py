@@ -1,8 +1,8 @@
-"""What one node says about itself, asked in its own words as far as its firmware knows the questions."""
+"""Information that one node reports about itself, by those queries that its firmware knows."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final, TypeVar
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final
 
 from canbus_tools.bus.talk import BusTalk, NodeTalk
 from nodes.bus.assign import Uuid
@@ -12,7 +12,6 @@ from nodes.dictionary.parts import DictionaryError
 from nodes.support.can_protocol import UUID_SIZE
 from nodes.support.errors import CanductorError
 
-T = TypeVar("T")
 BUS_STATES: Final = "canbus_bus_state"
 _TICKS_PER_WORD: Final = 1 << 32
 _QUESTIONS: Final = (
@@ -25,7 +24,7 @@ _QUESTIONS: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Firmware:
-    """What a dictionary says of a build."""
+    """Properties of a firmware build, from its dictionary."""
 
     mcu: str
     version: str
@@ -36,20 +35,18 @@ class Firmware:
 
     @classmethod
     def common(cls, dictionaries: Sequence[Dictionary]) -> "Firmware":
-        """Read what all of them say."""
-        builds = [cls.of(dictionary) for dictionary in dictionaries]
-        return cls(
-            mcu=_same([build.mcu for build in builds]) or "",
-            version=_same([build.version for build in builds]) or "",
-            app=_same([build.app for build in builds]) or "",
-            build=_same([build.build for build in builds]) or "",
-            clock_hz=_same([build.clock_hz for build in builds]),
-            bitrate=_same([build.bitrate for build in builds]),
-        )
+        """Return the properties that all of them agree on; the others are empty or None."""
+        first, *others = (cls.of(dictionary) for dictionary in dictionaries)
+        unknown: dict[str, Any] = {
+            name: "" if isinstance(value, str) else None
+            for name, value in asdict(first).items()
+            if any(getattr(other, name) != value for other in others)
+        }
+        return replace(first, **unknown)
 
     @classmethod
     def of(cls, dictionary: Dictionary) -> "Firmware":
-        """Read what is there; what is missing or no sense is empty or None."""
+        """Read the properties; missing or invalid ones are empty or None."""
         return cls(
             mcu=_text(dictionary, "MCU"),
             version=dictionary.version,
@@ -73,12 +70,12 @@ class CanStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeInfo:
-    """What a node said. None: its firmware does not know the question."""
+    """Information about a node. None: its firmware does not know the query."""
 
     firmware: Firmware
     uuid: Uuid | None = None
     believed_nodeid: int | None = None
-    """The id that it says it has."""
+    """The id that it reports."""
     uptime_s: float | None = None
     configured: bool | None = None
     shut_down: bool | None = None
@@ -86,14 +83,14 @@ class NodeInfo:
 
 
 async def read_node_info(bus: BusTalk, nodeid: int) -> NodeInfo:
-    """Ask node NODEID, to whom nobody else talks; raises CanductorError."""
+    """Query node NODEID, which no other host uses; raises CanductorError."""
     async with bus.node(nodeid) as talk:
         said = [await _said(talk, command, response) for command, response in _QUESTIONS]
         return node_info_of((talk.dictionary,), {message.name: message for message in said if message})
 
 
 def node_info_of(alike: Sequence[Dictionary], said: Mapping[str, Message]) -> NodeInfo:
-    """Return what a node SAID, by name; of several dictionaries that it may have what all of them say."""
+    """Return the information from responses by name; of several possible dictionaries what all agree on."""
     firmware = Firmware.common(alike)
     board, config = said.get("canbus_id"), said.get("config")
     return NodeInfo(
@@ -108,14 +105,10 @@ def node_info_of(alike: Sequence[Dictionary], said: Mapping[str, Message]) -> No
 
 
 async def _said(talk: NodeTalk, command: str, response: str) -> Message | None:
-    """Return the answer; None when the firmware lacks the question, or puts it otherwise than we know it."""
+    """Return the answer; None if the firmware lacks the query, or has it with other parameters."""
     if not talk.knows(command, response) or talk.dictionary.commands[command].names:
         return None
     return (await talk.ask(command, response)).message
-
-
-def _same(values: Sequence[T]) -> T | None:
-    return values[0] if all(value == values[0] for value in values) else None
 
 
 def _text(dictionary: Dictionary, constant: str) -> str:

@@ -1,6 +1,6 @@
-"""What is known of nodes in use without asking them: their own words to their host, observed.
+"""Information about nodes in use, without queries: from their traffic with their host.
 
-Hosts ask their nodes for clocks, and those on CAN for their error counters, about once a second.
+Hosts query the clocks of their nodes, and on CAN their error counters, about once a second.
 """
 
 from typing import Final
@@ -19,7 +19,7 @@ ID_MAX: Final = 0x7FF
 
 
 class PassiveDiscovery:
-    """Listens along on one bus."""
+    """Evaluates the traffic of one bus."""
 
     def __init__(self, cache: DictionaryCache) -> None:
         self._source = DictionarySource(cache=cache)
@@ -27,7 +27,7 @@ class PassiveDiscovery:
         self._said: dict[int, dict[str, Message]] = {}
 
     def frame(self, frame: Frame) -> None:
-        """Take a frame that other programs sent, or that answers them."""
+        """Take a frame between a node and another program."""
         if frame.can_id > ID_MAX:
             return
         for said in self._decoder.feed(BusFrame(frame.received_ns * 1e-9, frame.can_id, frame.data)):
@@ -36,11 +36,11 @@ class PassiveDiscovery:
                 messages[said.name] = Message(said.name, dict(said.params))
 
     def is_open(self, nodeid: int) -> bool:
-        """Tell whether listening on may make NODEID's dictionary known."""
+        """Return whether more traffic may identify NODEID's dictionary."""
         return self._source.is_open(nodeid)
 
     def facts(self, nodeid: int) -> NodeInfo | None:
-        """Return what is known of a node; None: its dictionary is not."""
+        """Return the information about a node; None: its dictionary is unknown."""
         dictionary = self._source.known.get(nodeid)
         if dictionary is None:
             return None

@@ -36,7 +36,6 @@ class DirectionFacts:
     """What was observed of one node; blocks are the protocol's."""
 
     nodeid: int
-    from_blocks: int
     to_blocks: int
     invalid_bytes: int
     """That the node sent and that made no block here."""
@@ -92,14 +91,3 @@ class NodeFacts:
     """Nodes that said what they are and then answered no more: what went wrong, in a sentence."""
     heard_at: Mapping[int, int] = field(default_factory=dict)
     """Frames heard by bit rate, where other bit rates were tried."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BusAddress:
-    """Which bus, for the commands that the doctor names."""
-
-    name: str
-    words: str
-    """``-c can0``"""
-    socketcan: bool
-    bitrate: int | None

@@ -1,43 +1,34 @@
-"""One thing that the doctor has to say."""
+"""Findings of the doctor."""
 
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
+from functools import partial
 
 
-class Severity(Enum):
-    """How bad it is."""
+class Severity(StrEnum):
+    """Severity of a finding."""
 
     PROBLEM = "problem"
-    """It does not work, or will not for long."""
+    """The bus does not work, or will fail soon."""
     WARNING = "warning"
-    """It works, and will fail on a worse day."""
+    """The bus works, but may fail under load."""
     NOTE = "note"
-    """Good to know; no reason for a bad exit status."""
+    """Information; does not affect the exit status."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Finding:
-    """What was seen, what it means, what to do."""
+    """An observation, its meaning and its cure."""
 
+    severity: Severity
     name: str
     """Short and fixed, for scripts: ``interface-down``."""
-    severity: Severity
     seen: str
     means: str
     do: str
-    """With the command that does it, where there is one."""
+    """Including the command to use, if there is one."""
 
 
-def problem(name: str, seen: str, means: str, do: str) -> Finding:
-    """Return a finding of that severity."""
-    return Finding(name=name, severity=Severity.PROBLEM, seen=seen, means=means, do=do)
-
-
-def warning(name: str, seen: str, means: str, do: str) -> Finding:
-    """Return a finding of that severity."""
-    return Finding(name=name, severity=Severity.WARNING, seen=seen, means=means, do=do)
-
-
-def note(name: str, seen: str, means: str, do: str) -> Finding:
-    """Return a finding of that severity."""
-    return Finding(name=name, severity=Severity.NOTE, seen=seen, means=means, do=do)
+problem = partial(Finding, Severity.PROBLEM)
+warning = partial(Finding, Severity.WARNING)
+note = partial(Finding, Severity.NOTE)

@@ -1,4 +1,4 @@
-"""Gathers what the doctor judges: from the kernel, by listening, and by asking."""
+"""Gathers the facts for the doctor: from the kernel, by listening, and by queries."""
 
 import asyncio
 import errno
@@ -16,7 +16,7 @@ from canbus_tools.bus.computer import Computer, now_s
 from canbus_tools.bus.link_facts import LinkFacts, NoInterface, read_link
 from canbus_tools.bus.open_bus import BusOptions, open_bus
 from canbus_tools.bus.talk import BusTalk
-from canbus_tools.discovery.inventory import PROBED, Inventory, NodePresence, take_inventory
+from canbus_tools.discovery.inventory import Inventory, NodePresence, take_inventory
 from canbus_tools.doctor.facts import (
     AdapterFacts,
     DirectionFacts,
@@ -33,17 +33,17 @@ from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.support.errors import CanductorError
 
 ASKED: Final = 100
-"""Questions to each node."""
+"""Queries to each node."""
 PING_S_MAX: Final = 5.0
-"""For one node; a bus that loses much makes every question take long."""
+"""Longest time for one node; on a bus that loses many frames every query takes long."""
 LATE_S: Final = 0.2
-"""For late answers to the last questions."""
+"""Time for late answers to the last queries."""
 TRIED_BITRATES: Final = (1_000_000, 500_000, 250_000, 125_000)
 _SYS_NET: Final = Path("/sys/class/net")
 _ARPHRD_CAN: Final = "280"
 _BURST: Final = 16
 NO_COMMAND: Final = 0xFF
-"""An admin command that does not exist: nodes ignore it, and no late answer disturbs what is asked next."""
+"""An admin command that does not exist: nodes ignore it, so no late answer disturbs the next query."""
 _QUESTIONS: Final = (("get_uptime", "uptime"), ("get_clock", "clock"), ("get_config", "config"))
 
 
@@ -51,7 +51,7 @@ _QUESTIONS: Final = (("get_uptime", "uptime"), ("get_clock", "clock"), ("get_con
 
 
 def read_interface(name: str, folder: Path = _SYS_NET) -> InterfaceFacts:
-    """Read all about a SocketCAN interface; raises CanductorError when ip cannot be used."""
+    """Read the facts of a SocketCAN interface; raises CanductorError if ip cannot be used."""
     others = tuple(sorted(path.name for path in folder.glob("*") if _text(path / "type") == _ARPHRD_CAN))
     try:
         link = read_link(name)
@@ -61,7 +61,7 @@ def read_interface(name: str, folder: Path = _SYS_NET) -> InterfaceFacts:
 
 
 def read_adapter(interface: Path, link: LinkFacts | None = None) -> AdapterFacts:
-    """Read what drives an interface, from its folder below /sys."""
+    """Read the driver and adapter of an interface from its folder below /sys."""
     device = interface / "device"
     driver = (device / "driver").resolve().name if (device / "driver").exists() else ""
     usb = device.resolve().parent if device.exists() else device
@@ -86,7 +86,7 @@ def _text(path: Path) -> str:
 
 
 class BusListener:
-    """Listens on a bus of its own handle while ``wait`` waits; ``facts`` returns what it heard."""
+    """Listens on a bus, opened for itself, during ``wait``; ``facts`` returns the result."""
 
     def __init__(self, computer: Computer, options: BusOptions, bitrate: int | None) -> None:
         self._computer = computer
@@ -120,10 +120,10 @@ class BusListener:
         while (left_s := end_s - now_s(self._computer)) > 0:
             self._take(self._bus.take(left_s))
 
-    def end_of_calm(self) -> None:
-        """From now on this program sends, too: only answers and error reports are still taken.
+    def start_of_queries(self) -> None:
+        """Receive only answers and error reports from now on, as this program starts to send.
 
-        The others are not even read, where the kernel filters: that would slow down what sends and asks.
+        Where the kernel filters, other frames are not even read, which would slow down the queries.
         """
         self._bus.only(ADMIN_RESPONSE_ID)
         self._calm = self._figures()
@@ -138,7 +138,7 @@ class BusListener:
     def _take(self, frames: Iterable[Frame]) -> None:
         for frame in frames:
             if self._meter is not None:
-                # By this clock: some backends have others.
+                # Times of this clock: some backends use others.
                 self._meter.feed(frame._replace(time_s=now_s(self._computer)))
             self._count(frame)
 
@@ -152,7 +152,7 @@ class BusListener:
     def facts(
         self, before: LinkFacts | None = None, after: LinkFacts | None = None, *, queue_full: bool = False
     ) -> TrafficFacts:
-        """Return what was heard until ``with`` ended; error reports also while this program sent."""
+        """Return the traffic before the queries, and the error reports until ``with`` ended."""
         load, other_frames, ways = self._calm or self._figures()
         return TrafficFacts(
             listened_s=self._ended_s - self._started_s,
@@ -174,9 +174,8 @@ class BusListener:
             found.append(
                 DirectionFacts(
                     nodeid=nodeid,
-                    from_blocks=node.from_node.blocks,
                     to_blocks=node.to_node.blocks,
-                    # One stretch may be the end of a block that began before we listened.
+                    # A single stretch may be the end of a block that began before this listener.
                     invalid_bytes=node.from_node.invalid_bytes if node.from_node.noises > 1 else 0,
                     repeated_blocks=node.flow.repeated_blocks,
                     naks=node.flow.naks,
@@ -188,7 +187,7 @@ class BusListener:
 
 
 def error_kinds(frame: Frame) -> set[str]:
-    """Tell what an error frame of linux/can/error.h reports."""
+    """Return the kinds of errors that an error frame (linux/can/error.h) reports."""
     kinds = set()
     data = frame.data.ljust(8, b"\0")
     if frame.can_id & 0x020:
@@ -203,7 +202,7 @@ def error_kinds(frame: Frame) -> set[str]:
 
 
 def fill_queue(options: BusOptions) -> bool:
-    """Tell whether a burst of short frames overflows the send queue; raises CanductorError."""
+    """Return whether a burst of short frames overflows the send queue; raises CanductorError."""
     bus = open_bus(options)
     nothing = can.Message(arbitration_id=ADMIN_ID, data=bytes([NO_COMMAND]), is_extended_id=False)
     try:
@@ -221,30 +220,29 @@ def fill_queue(options: BusOptions) -> bool:
 # ----------------------------------------------------------------------------------------------------- asking
 
 
-async def ask_nodes(computer: Computer, options: BusOptions, probed: range = PROBED) -> NodeFacts:
-    """Find all nodes, and put questions to those to whom nobody else talks; raises CanductorError."""
-    async with BusTalk.open(computer, options) as bus:
-        found = await take_inventory(bus, probed=probed)
-        pings: list[PingFacts] = []
-        silenced: dict[int, str] = {}
-        for nodeid in _askable(found):
-            try:
-                pings.append(await _ping(bus, nodeid))
-            except CanductorError as error:
-                if bus.closed_because is not None:
-                    raise
-                silenced[nodeid] = str(error)
+async def query_nodes(bus: BusTalk) -> NodeFacts:
+    """Find all nodes, and query those that no other host uses; raises CanductorError."""
+    found = await take_inventory(bus)
+    pings: list[PingFacts] = []
+    silenced: dict[int, str] = {}
+    for nodeid in _available(found):
+        try:
+            pings.append(await _ping(bus, nodeid))
+        except CanductorError as error:
+            if bus.closed_because is not None:
+                raise
+            silenced[nodeid] = str(error)
     return NodeFacts(inventory=found, pings=tuple(pings), silenced=silenced)
 
 
-def _askable(found: Inventory) -> list[int]:
+def _available(found: Inventory) -> list[int]:
     calm = (NodePresence.IDLE, NodePresence.CONFIGURED, NodePresence.SHUTDOWN)
     return [entry.nodeid for entry in found.entries if entry.nodeid is not None and entry.state in calm]
 
 
 async def _ping(bus: BusTalk, nodeid: int) -> PingFacts:
     async with bus.node(nodeid) as talk:
-        # What it took to learn the dictionary is no measure of the bus.
+        # The download of the dictionary is not part of the measurement.
         before = talk.stats
         question = next((words for words in _QUESTIONS if talk.knows(*words)), _QUESTIONS[0])
         trips = RoundTrips()

@@ -1,4 +1,4 @@
-"""Whether the interface is fit for use."""
+"""Checks of the interface."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -22,7 +22,7 @@ ERRORS_PASSIVE: Final = 128
 
 
 def check_presence(facts: InterfaceFacts) -> Iterator[Finding]:
-    """Find an interface that is not there, is none of CAN, or is down; nothing else works before."""
+    """Check that the interface exists, is a CAN interface and is up, without which nothing else works."""
     name, link = facts.name, facts.link
     if link is None:
         there = ", ".join(facts.others)
@@ -30,15 +30,15 @@ def check_presence(facts: InterfaceFacts) -> Iterator[Finding]:
             "interface-missing",
             f"there is no network interface {name}; CAN interfaces here: {there or 'none'}",
             "the adapter is not plugged in, its driver is not loaded, or the interface has another name",
-            f"use one that is there: 'canductor can doctor -c {facts.others[0]}'"
+            f"use an existing one: 'canductor can doctor -c {facts.others[0]}'"
             if there
-            else "plug the adapter in and look what the kernel says: dmesg | grep -i can",
+            else "plug the adapter in and check the kernel's messages: dmesg | grep -i can",
         )
     elif not link.kind:
         yield problem(
             "not-can",
-            f"{name} is a network interface, but not of CAN",
-            "nothing of this protocol can go over it",
+            f"{name} is not a CAN interface",
+            "this protocol cannot use it",
             f"use a CAN interface ({', '.join(facts.others) or 'there is none here'})",
         )
     elif not link.up:
@@ -46,14 +46,13 @@ def check_presence(facts: InterfaceFacts) -> Iterator[Finding]:
         yield problem(
             "interface-down",
             f"{name} is down",
-            "it neither sends nor receives; nobody set it up since the machine started, or somebody took it"
-            " down",
+            "it neither sends nor receives; it was not set up since the machine started, or was taken down",
             f"sudo ip link set {name} up{bitrate}",
         )
 
 
 def check_link(facts: InterfaceFacts) -> Iterator[Finding]:
-    """Judge how the interface is set, and what its controller has counted."""
+    """Check the settings of the interface and the counters of its controller."""
     if facts.link is None or not facts.link.up:
         return
     yield from _queue(facts.link)
@@ -73,9 +72,8 @@ def _queue(link: LinkFacts) -> Iterator[Finding]:
         yield warning(
             "txqueuelen-small",
             f"the send queue of {link.name} holds {length} frames (txqueuelen)",
-            "a burst of frames does not fit: programs get 'No buffer space available' (ENOBUFS), and some"
-            " lose"
-            " the frame",
+            "a burst of frames does not fit: programs get 'No buffer space available' (ENOBUFS), and some "
+            "lose the frame",
             fix,
         )
     elif length > QUEUE_MAX:
@@ -84,9 +82,8 @@ def _queue(link: LinkFacts) -> Iterator[Finding]:
         yield warning(
             "txqueuelen-large",
             f"the send queue of {link.name} holds {length} frames (txqueuelen)",
-            f"on a busy bus a frame may wait {wait_ms:,.0f} ms behind others, an emergency stop too; a long"
-            " queue"
-            " hides a bus that is too slow until commands come too late",
+            f"on a busy bus a frame may wait {wait_ms:,.0f} ms behind others, an emergency stop too; a long "
+            "queue hides a bus that is too slow until commands come too late",
             fix,
         )
 
@@ -161,14 +158,12 @@ CABLE: Final = (
 def _cause(tx: int, rx: int) -> str:
     if tx > rx:
         return (
-            "what it sends is not acknowledged: nobody else is on the bus, or all others run at another bit"
-            " rate,"
-            " have no power or are cut off"
+            "its frames are not acknowledged: no other node is on the bus, or all others run at another bit "
+            "rate, have no power or are cut off"
         )
     return (
-        "it hears frames that are damaged: a missing or surplus terminator, swapped wires, a loose crimp,"
-        " or nodes"
-        " at another bit rate"
+        "it hears frames that are damaged: a missing or surplus terminator, swapped wires, a loose crimp, or "
+        "nodes at another bit rate"
     )
 
 
@@ -184,9 +179,8 @@ def _history(link: LinkFacts) -> Iterator[Finding]:
         yield warning(
             "adapter-overruns",
             f"the adapter of {link.name} had no room for {link.rx_overruns} frames it received (overruns)",
-            "frames are lost in the adapter or its driver: the host is too slow in fetching them, often a"
-            " busy"
-            " USB hub or SPI",
+            "frames are lost in the adapter or its driver: the host is too slow in fetching them, often a "
+            "busy USB hub or SPI",
             "connect the adapter to a port of its own; 'ip -s link show "
             + link.name
             + "' shows whether it grows",
@@ -200,12 +194,10 @@ def _adapter(facts: InterfaceFacts) -> Iterator[Finding]:
         yield warning(
             "kernel-reorders",
             f"{facts.name} is driven by {fault.driver} of kernel {adapter.kernel}",
-            f"before {fixed} that driver {fault.what}; blocks arrive in pieces, hosts count bytes_invalid"
-            " and time"
-            f" out ({fault.source})",
-            f"update the kernel to {fixed} or newer (uname -r; sudo apt full-upgrade), or use a"
-            " distribution that"
-            " took the change over",
+            f"before {fixed} that driver {fault.what}; blocks arrive in pieces, hosts count bytes_invalid "
+            f"and time out ({fault.source})",
+            f"update the kernel to {fixed} or newer (uname -r; sudo apt full-upgrade), or use a "
+            "distribution that took the change over",
         )
 
 

@@ -1,11 +1,12 @@
-"""Whether the nodes are well."""
+"""Checks of the nodes."""
 
 from collections import defaultdict
 from collections.abc import Iterator
 from typing import Final
 
+from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.discovery.inventory import InventoryEntry, NodePresence
-from canbus_tools.doctor.facts import BusAddress, NodeFacts, PingFacts
+from canbus_tools.doctor.facts import NodeFacts, PingFacts
 from canbus_tools.doctor.finding import Finding, note, problem, warning
 from canbus_tools.doctor.traffic import RTT_SPREAD_S, slow
 from nodes.support.can_protocol import FIRST_NODEID, LAST_NODEID
@@ -13,50 +14,48 @@ from nodes.support.can_protocol import FIRST_NODEID, LAST_NODEID
 SAID_ACTIVE: Final = "active"
 LOSS_MANY: Final = 0.02
 NODE_ERRORS: Final = 96
-"""Of a node's error counters: from here on a controller warns."""
+"""Value of a node's error counters from which a controller is in the state "warning"."""
 
 
-def check_nodes(facts: NodeFacts, place: BusAddress) -> Iterator[Finding]:
-    """Judge who is there, and how they are."""
+def check_nodes(facts: NodeFacts, bus: BusOptions) -> Iterator[Finding]:
+    """Check which nodes there are, and their state."""
     entries = facts.inventory.entries
     if not entries:
-        yield _nobody(facts, place)
+        yield _no_nodes(facts, bus)
     yield from _twins(entries)
     yield from _shared_ids(facts, entries)
     free = _free_id(facts)
     for entry in entries:
-        yield from _node(entry, place, free)
+        yield from _node(entry, bus, free)
     for nodeid, said in facts.silenced.items():
-        yield _went_silent(nodeid, said, place)
+        yield _went_silent(nodeid, said, bus)
     for ping in facts.pings:
-        yield from _ping(ping, place)
+        yield from _ping(ping, bus)
 
 
-def _nobody(facts: NodeFacts, place: BusAddress) -> Finding:
+def _no_nodes(facts: NodeFacts, bus: BusOptions) -> Finding:
     best = max(facts.heard_at.items(), key=lambda item: item[1], default=(0, 0))
     if best[1]:
         return problem(
             "other-bitrate",
-            f"no node answers on {place.name} at its bit rate, but {best[1]} frames were heard at {best[0]}"
+            f"no node answers on {bus.name} at its bit rate, but {best[1]} frames were heard at {best[0]}"
             " bit/s",
             "the nodes run at another bit rate than this interface",
-            f"sudo ip link set {place.name} down; sudo ip link set {place.name} up type can bitrate {best[0]}"
+            f"sudo ip link set {bus.name} down; sudo ip link set {bus.name} up type can bitrate {best[0]}"
             " restart-ms 100"
-            if place.socketcan
+            if bus.is_socketcan
             else f"give --bitrate {best[0]}",
         )
     tried = ", ".join(map(str, facts.heard_at))
-    at = f" at {place.bitrate} bit/s" if place.bitrate else ""
+    at = f" at {bus.bitrate} bit/s" if bus.bitrate else ""
     return problem(
         "no-nodes",
-        f"0 uuids found: no node answers on {place.name}{at}"
+        f"0 uuids found: no node answers on {bus.name}{at}"
         + (f"; nothing heard at {tried} either" if tried else ""),
-        "the nodes have no power, are cut off, were built for another bit rate (CANBUS_FREQUENCY) or for"
-        " USB, or"
-        " run no firmware at all",
-        "check power, CANH and CANL, two terminators of 120 ohm (60 between the wires), and the bit rate in"
-        " the"
-        f" nodes' firmware settings; then ask again: 'canductor can query {place.words}'",
+        "the nodes have no power, are cut off, were built for another bit rate (CANBUS_FREQUENCY) or for "
+        "USB, or run no firmware at all",
+        "check power, CANH and CANL, two terminators of 120 ohm (60 between the wires), and the bit rate "
+        f"in the nodes' firmware settings; then ask again: 'canductor can query {bus.arguments}'",
     )
 
 
@@ -66,10 +65,9 @@ def _twins(entries: tuple[InventoryEntry, ...]) -> Iterator[Finding]:
         yield problem(
             "duplicate-uuid",
             f"more than one board answers with the uuid {uuid}",
-            "their chips have the same serial number (cloned chips), or one wrote the other's: a host"
-            " cannot tell"
-            " them apart, and both would take one id",
-            "take one of them off the bus, or build its firmware with a uuid of its own",
+            "their chips have the same serial number (cloned chips), or one wrote the other's: a host "
+            "cannot tell them apart, and both would take one id",
+            "disconnect one of them, or build its firmware with a different uuid",
         )
 
 
@@ -85,9 +83,8 @@ def _shared_ids(facts: NodeFacts, entries: tuple[InventoryEntry, ...]) -> Iterat
             yield problem(
                 "duplicate-nodeid",
                 f"node id {nodeid} is used by more than one board: {', '.join(sorted(uuids))}",
-                "both act on every command and their answers collide; two hosts gave out ids, or a board"
-                " kept its"
-                " id when another host began",
+                "both act on every command and their answers collide; two hosts gave out ids, or a board "
+                "kept its id when another host began",
                 "stop all hosts but one, switch these boards off and on, and let that one host give out the"
                 " ids",
             )
@@ -98,48 +95,48 @@ def _free_id(facts: NodeFacts) -> int:
     return next(nodeid for nodeid in range(FIRST_NODEID, LAST_NODEID + 2) if nodeid not in taken)
 
 
-def _went_silent(nodeid: int, said: str, place: BusAddress) -> Finding:
+def _went_silent(nodeid: int, said: str, bus: BusOptions) -> Finding:
     return problem(
         "node-went-silent",
-        f"node {nodeid} said what it is, and then answered no more: {said}",
+        f"node {nodeid} answered its first queries, but no further ones: {said}",
         "while it was asked it was reset, lost its power, or its controller went off the bus (bus-off); when"
         " several nodes fall silent together, this computer's adapter may have",
-        f"look whether it is back: 'canductor can nodes {place.words}'. If it waits for an id, it was reset:"
-        " look at its power; if it has its id, look at its cable, its crimp and the termination",
+        f"look whether it is back: 'canductor can nodes {bus.arguments}'. If it waits for an id, it was "
+        "reset: look at its power; if it has its id, look at its cable, its crimp and the termination",
     )
 
 
-def _node(entry: InventoryEntry, place: BusAddress, free: int) -> Iterator[Finding]:
+def _node(entry: InventoryEntry, bus: BusOptions, free: int) -> Iterator[Finding]:
     name = _name(entry)
     if entry.state is NodePresence.SHUTDOWN:
         yield warning(
             "node-shutdown",
             f"{name} is in shutdown",
-            "it met an error or was told to stop, and does nothing until it is reset",
-            f"restart its host (FIRMWARE_RESTART in Klipper), or talk to it: 'canductor console {place.words}"
-            f" --node {entry.nodeid}', and there: reset",
+            "an error or an emergency stop made it shut down; it does nothing until it is reset",
+            "restart its host (FIRMWARE_RESTART in Klipper), or talk to it: 'canductor console "
+            f"{bus.arguments} --node {entry.nodeid}', and there: reset",
         )
     elif entry.state is NodePresence.BOOTLOADER:
         yield warning(
             "node-in-bootloader",
             f"{name} is in its bootloader (Katapult)",
-            "it has no firmware that runs, or somebody asked for the bootloader: no host can use it",
+            "its firmware did not start, or the bootloader was requested: no host can use it",
             f"flash it (flashtool.py -u {entry.uuid}), or press reset once",
         )
     elif entry.state is NodePresence.WAITING and not entry.twins:
         yield note(
             "node-waits",
             f"{name} waits for an id",
-            "that is normal as long as no host runs that has it in its configuration",
+            "that is normal while no host runs that has this node in its configuration",
             "put its uuid into the host's configuration; to try it:"
-            f" 'canductor can assign {entry.uuid} {free} {place.words}'",
+            f" 'canductor can assign {entry.uuid} {free} {bus.arguments}'",
         )
     elif entry.state is NodePresence.UNCLEAR and entry.trouble and "more than one board" not in entry.trouble:
         yield warning(
             "node-unclear",
             f"{name}: {entry.trouble}",
-            "it could not be asked how it is",
-            f"switch it off and on, then look again: 'canductor can nodes {place.words}'",
+            "its state could not be read",
+            f"switch it off and on, then check again: 'canductor can nodes {bus.arguments}'",
         )
     status = entry.facts.can if entry.facts is not None else None
     if status is not None and (
@@ -147,31 +144,29 @@ def _node(entry: InventoryEntry, place: BusAddress, free: int) -> Iterator[Findi
     ):
         yield warning(
             "node-can-errors",
-            f"{name} says: error counters {status.rx_errors} receiving, {status.tx_errors} sending,"
+            f"{name} reports: error counters {status.rx_errors} receiving, {status.tx_errors} sending,"
             f" {status.tx_retries} retries, bus state {status.state}",
-            "its place on the bus is bad: its crimp, its stub, or a terminator near it",
-            "swap its cable with that of a good node and look whether the counters follow the cable or the"
-            " board",
+            "its connection to the bus is bad: its crimp, its stub, or a terminator near it",
+            "swap its cable with that of a good node, and check whether the errors follow the "
+            "cable or the board",
         )
 
 
-def _ping(ping: PingFacts, place: BusAddress) -> Iterator[Finding]:
+def _ping(ping: PingFacts, bus: BusOptions) -> Iterator[Finding]:
     if ping.lost or ping.invalid_bytes:
         found = problem if ping.lost > LOSS_MANY * ping.asked else warning
         yield found(
             "frames-lost",
-            f"of {ping.asked} questions to node {ping.nodeid}, {ping.lost} got lost with no trace, and"
+            f"of {ping.asked} queries to node {ping.nodeid}, {ping.lost} got lost without a trace, and"
             f" {ping.invalid_bytes} bytes of its answers were no valid block ({ping.repeats} blocks were"
             " repeated)",
-            "frames get lost between this program and the node. On the wire controllers repeat what was"
-            " damaged,"
-            " so it is the adapter, the kernel, or the node's receive buffer",
-            f"look at the counters: ip -details -statistics link show {place.name}; try another USB port,"
-            " cable or"
-            " adapter, and a kernel of 6.6 or newer",
+            "frames get lost between this program and the node. On the wire controllers repeat what was "
+            "damaged, so it is the adapter, the kernel, or the node's receive buffer",
+            f"look at the counters: ip -details -statistics link show {bus.name}; try another USB port, "
+            "cable or adapter, and a kernel of 6.6 or newer",
         )
     if ping.rtt_p99_s > RTT_SPREAD_S:
-        yield slow(ping.nodeid, ping.rtt_median_s, ping.rtt_p99_s, f"{ping.asked} questions")
+        yield slow(ping.nodeid, ping.rtt_median_s, ping.rtt_p99_s, f"{ping.asked} queries")
 
 
 def _name(entry: InventoryEntry) -> str:

@@ -1,9 +1,10 @@
-"""Whether the bus carries what it should."""
+"""Checks of the traffic."""
 
 from collections.abc import Iterator
 from typing import Final
 
-from canbus_tools.doctor.facts import BusAddress, DirectionFacts, InterfaceFacts, TrafficFacts
+from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.doctor.facts import DirectionFacts, InterfaceFacts, TrafficFacts
 from canbus_tools.doctor.finding import Finding, note, problem, warning
 from canbus_tools.doctor.interface import CABLE
 from canbus_tools.doctor.known_faults import CANDLELIGHT_FAULT, CANDLELIGHT_USB
@@ -13,41 +14,40 @@ LOAD_FULL: Final = 0.9
 REPEATS_MANY: Final = 0.01
 """Of another host's blocks."""
 RTT_SPREAD_S: Final = 0.02
-"""A p99 beyond this is a risk for commands that are sent shortly before they are due."""
+"""With a higher p99, commands that are sent shortly before their time may be late."""
 WIRE_ERRORS: Final = ("form", "stuff", "bit")
 
 
 def check_traffic(
-    facts: TrafficFacts, interface: InterfaceFacts | None, place: BusAddress
+    facts: TrafficFacts, interface: InterfaceFacts | None, bus: BusOptions
 ) -> Iterator[Finding]:
-    """Judge what was observed."""
-    yield from _load(facts, place)
+    """Check the observed traffic."""
+    yield from _load(facts, bus)
     yield from _errors(facts)
-    yield from _lost(facts, place)
+    yield from _lost(facts, bus)
     for way in facts.nodes:
         yield from _node(way, interface)
     if facts.other_frames:
         yield note(
             "other-protocol",
             f"{facts.other_frames} of {facts.frames} frames belong to no node of this protocol",
-            "another protocol shares the bus; that works, but takes its part of the time",
-            f"see who: 'canductor can load {place.words}'",
+            "another protocol shares the bus; that works, but uses part of its capacity",
+            f"list its ids: 'canductor can load {bus.arguments}'",
         )
 
 
-def _load(facts: TrafficFacts, place: BusAddress) -> Iterator[Finding]:
+def _load(facts: TrafficFacts, bus: BusOptions) -> Iterator[Finding]:
     if facts.load is None or facts.load.mean < LOAD_HIGH:
         return
     load = facts.load
     busiest = max(load.classes.items(), key=lambda item: item[1].bits)
-    seen = f"the bus is {load.mean:.0%} busy, most of it by frames of the class '{busiest[0].value}'"
+    seen = f"the load of the bus is {load.mean:.0%}, most of it from the class '{busiest[0].value}'"
     do = (
-        f"see who sends so much: 'canductor can load {place.words} --watch'; a higher bit rate (all nodes"
-        " have to be"
-        " flashed for it), or a second bus for some of the nodes, makes room"
+        f"find the cause of the load: 'canductor can load {bus.arguments} --watch'; a higher bit rate (all "
+        "nodes have to be flashed for it), or a second bus for some of the nodes, makes room"
     )
     if load.mean >= LOAD_FULL:
-        means = "frames with high ids hardly get through: what nodes and hosts say is late, up to time-outs"
+        means = "frames with high ids are delayed: nodes and hosts receive late, up to time-outs"
         yield problem("bus-overloaded", seen, means, do)
     else:
         yield warning("bus-busy", seen, "bursts already wait for each other, and errors leave no reserve", do)
@@ -57,18 +57,17 @@ def _errors(facts: TrafficFacts) -> Iterator[Finding]:
     if facts.errors.get("bus off"):
         yield problem(
             "went-bus-off",
-            "the controller went off the bus (bus-off) while it was watched",
-            "it met too many errors in a row: a short, an open wire, or another bit rate than the nodes'",
+            "the controller went off the bus (bus-off) during the check",
+            "it detected too many errors: a short, an open wire, or another bit rate than the nodes'",
             CABLE,
         )
     acks = facts.errors.get("ack", 0)
     if acks:
         yield problem(
             "nobody-acknowledges",
-            f"{acks} error reports say that nobody acknowledged a frame",
-            "no other controller hears this one: it is alone, cut off, or all others run at another bit"
-            " rate or"
-            " have no power",
+            f"{acks} error reports of frames that no controller acknowledged",
+            "no other controller hears this one: it is alone, cut off, or all others run at another bit "
+            "rate or have no power",
             "check power and plugs of the nodes, then the bit rate they were built for; " + CABLE,
         )
     damaged = sum(facts.errors.get(kind, 0) for kind in WIRE_ERRORS)
@@ -77,33 +76,32 @@ def _errors(facts: TrafficFacts) -> Iterator[Finding]:
         if facts.frames:
             yield warning(
                 "damaged-frames",
-                f"{damaged} error reports of damaged frames ({kinds}) beside {facts.frames} good frames",
-                "the signal is bad: a missing or surplus terminator, long stubs, a loose crimp, power wires"
-                " beside the bus",
+                f"{damaged} error reports of damaged frames ({kinds}), and {facts.frames} good frames",
+                "the signal is bad: a missing or surplus terminator, long stubs, a loose crimp, or power "
+                "wires next to the bus",
                 CABLE,
             )
         else:
             yield problem(
                 "only-damage",
                 f"{damaged} error reports of damaged frames ({kinds}) and not one good frame",
-                "somebody sends, and nothing of it can be read: most often the bit rate of this interface"
-                " is not"
-                " theirs, or H and L are swapped",
+                "frames are sent, but none can be read: most often the bit rate of this interface "
+                "is not theirs, or H and L are swapped",
                 "set the bit rate that the nodes were built for, or let 'canductor can doctor"
                 " --try-bitrates' find it",
             )
 
 
-def _lost(facts: TrafficFacts, place: BusAddress) -> Iterator[Finding]:
+def _lost(facts: TrafficFacts, bus: BusOptions) -> Iterator[Finding]:
     if facts.send_queue_full:
         yield problem(
             "send-queue-full",
             "a handful of short frames did not fit into the send queue ('No buffer space available',"
             " ENOBUFS)",
-            "the queue is very short, or full because nothing leaves it: nobody acknowledges, or the bus is"
-            " busy with frames that win arbitration",
-            f"sudo ip link set {place.name} txqueuelen 128; if it persists, see who is there:"
-            f" 'canductor can load {place.words}'",
+            "the queue is very short, or full because no frame leaves it: none is acknowledged, or frames "
+            "with higher priority occupy the bus",
+            f"sudo ip link set {bus.name} txqueuelen 128; if it persists, list the traffic:"
+            f" 'canductor can load {bus.arguments}'",
         )
     if facts.errors.get("overflow"):
         yield warning(
@@ -121,8 +119,8 @@ def _lost(facts: TrafficFacts, place: BusAddress) -> Iterator[Finding]:
             "frames-dropped",
             f"{lost} received frames were dropped while the bus was watched (counters of {after.name})",
             "the kernel or the adapter had no room: programs saw less than the bus carried",
-            "look for a program that takes all processor time; sudo sysctl net.core.rmem_max=2097152 helps"
-            " programs that ask for more",
+            "find a program that uses all processor time; sudo sysctl net.core.rmem_max=2097152 allows "
+            "larger receive buffers",
         )
     errors = after.bus_errors - before.bus_errors
     if errors > 0 and not facts.error_reports:
@@ -147,12 +145,10 @@ def _node(way: DirectionFacts, interface: InterfaceFacts | None) -> Iterator[Fin
     if way.to_blocks and way.repeated_blocks / way.to_blocks > REPEATS_MANY:
         yield warning(
             "bytes-retransmit",
-            f"{way.repeated_blocks} of {way.to_blocks} blocks to node {way.nodeid} were sent more than"
-            " once, and"
-            f" {way.naks} were refused (hosts count this as bytes_retransmit)",
-            "blocks or their acknowledgements get lost or come too late: an overloaded bus or host, or"
-            " frames lost"
-            " in the adapter",
+            f"{way.repeated_blocks} of {way.to_blocks} blocks to node {way.nodeid} were sent more than "
+            f"once, and {way.naks} were refused (hosts count this as bytes_retransmit)",
+            "blocks or their acknowledgements get lost or come too late: an overloaded bus or host, or "
+            "frames lost in the adapter",
             "see whether 'frames-dropped' or 'bus-overloaded' is reported here too; a few after a restart are"
             " normal",
         )
@@ -161,14 +157,13 @@ def _node(way: DirectionFacts, interface: InterfaceFacts | None) -> Iterator[Fin
 
 
 def slow(nodeid: int, median_s: float, p99_s: float, how: str) -> Finding:
-    """Return the finding for a node whose answers take very different times."""
+    """Return the finding for a node with widely spread round trips."""
     return warning(
         "round-trip-spread",
         f"node {nodeid} answers in {median_s * 1000:.1f} ms as a rule, but one answer in a hundred takes"
         f" {p99_s * 1000:.1f} ms or more (measured by {how})",
-        "commands sent shortly before they are due come too late, and the node's clock is known less well:"
-        " a busy"
-        " bus or host, a long send queue, or USB power saving",
+        "commands sent shortly before they are due come too late, and the node's clock is known less well: "
+        "a busy bus or host, a long send queue, or USB power saving",
         "compare under load and without: 'canductor can load'; turn power saving of the USB port off"
         " (echo on | sudo tee /sys/bus/usb/devices/*/power/control)",
     )

@@ -1,7 +1,6 @@
 """Faults as users write them: ``--loss 1%,id=0x109``, ``--bus-off 2s,at=5,sender=toolhead``.
 
-The first word is what the fault is about (a share, or how long); KEY=VALUE pairs behind it say whom it hits
-and when.
+The first word is a share of frames or a duration; KEY=VALUE pairs after it select frames, clients and times.
 """
 
 import argparse
@@ -17,7 +16,7 @@ _KINDS: Final = {
     "loss": (
         BusFaultKind.LOSE,
         "SHARE",
-        "frames do not arrive, or not at the receiver, though the sender sees them acknowledged",
+        "frames do not arrive, or not at the receiver, although the sender sees them acknowledged",
     ),
     "corrupt": (BusFaultKind.CORRUPT, "SHARE", "receivers get frames with one bit of the data changed"),
     "duplicate": (BusFaultKind.DUPLICATE, "SHARE", "frames arrive twice, as when an acknowledgement is lost"),
@@ -43,7 +42,7 @@ EXPLAINED: Final = """faults:
 
 
 class _RawHelp(Help, argparse.RawDescriptionHelpFormatter):
-    """Keeps the lines of the explanation."""
+    """Keeps the line breaks of the explanation."""
 
 
 def declare_faults(command: argparse.ArgumentParser) -> None:
@@ -56,7 +55,7 @@ def declare_faults(command: argparse.ArgumentParser) -> None:
 
 
 def read_faults(given: argparse.Namespace, names: Mapping[str, int]) -> list[tuple[str, BusFault]]:
-    """Return the faults with their text on the command line; NAMES: places of clients. Raises UsageError."""
+    """Return the faults with their options as text; NAMES: places of clients. Raises UsageError."""
     return [
         (f"{name} {text}", read_fault(name, text, names))
         for name in _KINDS
@@ -101,7 +100,9 @@ class _Reader:
             self.fields["time"] = self.time(first)
         elif first:
             self.fields["share"] = self.share(first)
-        values = {_FIELDS[key]: value for key, value in self.fields.items() if key not in ("id", "at")}
+        values = {
+            _FIELDS.get(key, key): value for key, value in self.fields.items() if key not in ("id", "at")
+        }
         can_id, mask = self.fields.get("id", (0, 0))
         try:
             fault = BusFault(kind=kind, can_id=can_id, mask=mask, **values)
@@ -121,7 +122,7 @@ class _Reader:
             if key in self.fields and kind not in kinds:
                 raise UsageError(f"{self.option} has no {key}=")
         if "at" in self.fields and self.fields.keys() - {"at", "sender"}:
-            raise UsageError(f"{self.option} with at= takes only sender= besides")
+            raise UsageError(f"{self.option} with at= takes no other key than sender=")
         if kind is BusFaultKind.BUS_OFF and not self.fields.keys() & {"at", "share", "frame"}:
             raise UsageError(f"{self.option} needs at=SECONDS, share= or frame= to know when")
 
@@ -145,9 +146,7 @@ class _Reader:
         if text in self._names:
             return self._names[text]
         if not text.isdecimal() and self._names:
-            raise UsageError(
-                f"{self.option}: no node '{text}' is started here, only {', '.join(self._names)}"
-            )
+            raise UsageError(f"{self.option}: unknown node '{text}'; the nodes are {', '.join(self._names)}")
         return parse_int(text, 0, CLIENTS - 1, name=f"{self.option}'s client")
 
     def id(self, text: str) -> tuple[int, int]:
@@ -170,15 +169,13 @@ _KEYS: Final[dict[str, Callable[[_Reader, str], Any]]] = {
     "at": _Reader.seconds,
 }
 _FIELDS: Final = {
-    "sender": "sender",
-    "receiver": "receiver",
     "frame": "nth",
     "from": "from_s",
     "until": "until_s",
-    "share": "share",
     "jitter": "jitter_s",
     "time": "time_s",
 }
+"""Fields of BusFault with other names than their keys."""
 _EXAMPLES: Final = {
     BusFaultKind.LOSE: "--loss 1%,id=0x109",
     BusFaultKind.CORRUPT: "--corrupt 1%",

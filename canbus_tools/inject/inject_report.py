@@ -1,4 +1,4 @@
-"""What a virtual bus with faults shows: a line while it runs, figures at its end."""
+"""Output of a virtual bus with faults: a status line while it runs, figures at the end."""
 
 import shutil
 import time
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Final, TextIO
 
+from canbus_tools.support.text_table import table
 from nodes.virtual.hub import BusStats, ClientStats, VirtualBus
 
 _DAMAGE: Final = {
@@ -18,15 +19,15 @@ _DAMAGE: Final = {
     "bus_offs": "bus-off",
     "unsent": "not sent while off",
     "unheard": "not heard while off",
-    "expelled": "clients expelled, as they did not read",
-    "refused": "clients refused, as all places were taken",
-    "rejected": "records that are no frame of this bus",
+    "expelled": "clients disconnected, as they did not read",
+    "refused": "clients refused, as there were too many",
+    "rejected": "invalid records",
 }
-"""Of BusStats: what is shown when it is not 0."""
+"""Counters of BusStats that are shown if they are not 0."""
 
 
 class StatusLine:
-    """One line on a terminal, written over itself."""
+    """A line on a terminal that is updated in place."""
 
     def __init__(self, stream: TextIO, bus: VirtualBus) -> None:
         """Show BUS, from now on, on STREAM."""
@@ -36,18 +37,18 @@ class StatusLine:
         self._before = bus.stats
 
     def show(self, socketcand_clients: int) -> None:
-        """Renew the line."""
+        """Update the line."""
         now_s, stats = time.monotonic(), self._bus.stats
         text = status(self._before, stats, now_s - self._last_s, now_s - self._begin_s)
         if socketcand_clients:
             text += f"  socketcand {socketcand_clients}"
-        width = shutil.get_terminal_size().columns - 1  # a line that wraps could not be written over
+        width = shutil.get_terminal_size().columns - 1  # a wrapped line could not be overwritten
         self._stream.write(f"\r\x1b[K{text[:width]}")
         self._stream.flush()
         self._last_s, self._before = now_s, stats
 
     def clear(self) -> None:
-        """Leave the line empty for what comes next."""
+        """Clear the line for further output."""
         self._stream.write("\r\x1b[K")
         self._stream.flush()
 
@@ -73,15 +74,11 @@ class InjectReport:
     ran_s: float
     stats: BusStats
     faults: tuple[str, ...]
-    """The words that asked for each fault."""
+    """The option that requested each fault."""
     nodes: Mapping[str, Mapping[str, Any]]
-    """What each node counted, by name, in the order of their places."""
+    """Counters of each node by name, in the order of their places."""
     socketcand: Mapping[str, int] | None
-
-    @property
-    def ok(self) -> bool:
-        """Always: what goes wrong here was asked for."""
-        return True
+    ok: bool = True
 
     def to_json(self) -> Mapping[str, object]:
         """Return all figures."""
@@ -101,7 +98,7 @@ class InjectReport:
     def to_text(self) -> str:
         """Return the figures for a reader."""
         stats = self.stats
-        rate = f"{self.bitrate:,} bit/s" if self.bitrate else "no limit of its rate"
+        rate = f"{self.bitrate:,} bit/s" if self.bitrate else "unlimited rate"
         load = f", load {stats.busy_ns / 1e9 / self.ran_s:.1%}" if self.bitrate and self.ran_s else ""
         lines = [f"{self.ran_s:.1f} s at {rate}, seed {self.seed}: {stats.frames:,} frames{load}"]
         figures = asdict(stats)
@@ -121,7 +118,7 @@ class InjectReport:
             (words, f"{count.picked:,}", f"{count.hits:,}")
             for words, count in zip(self.faults, self.stats.faults, strict=True)
         ]
-        return _table(("fault", "frames seen", "hits"), rows)
+        return _figures(("fault", "frames seen", "hits"), rows)
 
     def _client_lines(self) -> list[str]:
         names = list(self.nodes)
@@ -132,12 +129,9 @@ class InjectReport:
         rows = [
             (name_of(client), f"{client.sent:,}", f"{client.received:,}") for client in self.stats.clients
         ]
-        return _table(("still connected", "sent", "received"), rows)
+        return _figures(("still connected", "sent", "received"), rows)
 
 
-def _table(head: tuple[str, str, str], rows: list[tuple[str, str, str]]) -> list[str]:
-    """Return lines with the first column to the left and figures to the right; none without rows."""
-    if not rows:
-        return []
-    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(3)]
-    return [f"{row[0]:<{widths[0]}}  {row[1]:>{widths[1]}}  {row[2]:>{widths[2]}}" for row in [head, *rows]]
+def _figures(headings: tuple[str, str, str], rows: list[tuple[str, str, str]]) -> list[str]:
+    """Return a table with two columns of right-aligned figures; nothing without rows."""
+    return table(headings, [(row[0], f"{row[1]:>8}", f"{row[2]:>8}") for row in rows], "") if rows else []

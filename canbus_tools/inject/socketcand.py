@@ -58,10 +58,10 @@ class Subscription:
     mask: bytes | None
     """None: every frame; else only frames in which these bits, or the length, changed."""
     last: CanFrame | None = None
-    """The frame that was told last."""
+    """The last frame that was sent to the client."""
     next_s: float = -math.inf
     waiting: tuple[CanFrame, float] | None = None
-    """A frame and its Unix time, to be told at ``next_s``."""
+    """A frame and its Unix time, to be sent to the client at ``next_s``."""
 
     def is_new(self, frame: CanFrame) -> bool:
         """Whether the client wants to hear this frame."""
@@ -164,12 +164,6 @@ class SocketcandSession:
         self._held_until_s = now_s + SETTLE_S if mode is Mode.RAW else -math.inf
         self._say("ok")
 
-    def _raw_mode(self, words: list[str], now_s: float) -> None:
-        self._change_mode(Mode.RAW, words, now_s)
-
-    def _bcm_mode(self, words: list[str], now_s: float) -> None:
-        self._change_mode(Mode.BCM, words, now_s)
-
     def _echo(self, words: list[str], _: float) -> None:
         _no_more("echo", words)
         self._say("echo")
@@ -224,10 +218,10 @@ class SocketcandSession:
                 self._held.append((frame, unix_s))
             else:
                 self._let_go()
-                self._tell(frame, unix_s)
+                self._send_frame(frame, unix_s)
         elif (wanted := self._subscriptions.get(frame.id)) is not None and wanted.is_new(frame):
             wanted.waiting = (frame, unix_s)
-            self._tell_waiting(wanted, now_s)
+            self._send_waiting(wanted, now_s)
 
     def next_deadline(self) -> float:
         """When ``handle_timer`` has something to do; infinite when it has not."""
@@ -242,7 +236,7 @@ class SocketcandSession:
         if now_s >= self._held_until_s:
             self._let_go()
         for wanted in self._subscriptions.values():
-            self._tell_waiting(wanted, now_s)
+            self._send_waiting(wanted, now_s)
         for job in self._jobs.values():
             if now_s >= job.due_s:
                 self._frames.append(job.frame)
@@ -252,17 +246,17 @@ class SocketcandSession:
 
     def _let_go(self) -> None:
         for frame, unix_s in self._held:
-            self._tell(frame, unix_s)
+            self._send_frame(frame, unix_s)
         self._held.clear()
 
-    def _tell_waiting(self, wanted: Subscription, now_s: float) -> None:
+    def _send_waiting(self, wanted: Subscription, now_s: float) -> None:
         if wanted.waiting is None or now_s < wanted.next_s:
             return
         frame, unix_s = wanted.waiting
         wanted.waiting, wanted.last, wanted.next_s = None, frame, now_s + wanted.interval_s
-        self._tell(frame, unix_s)
+        self._send_frame(frame, unix_s)
 
-    def _tell(self, frame: CanFrame, unix_s: float) -> None:
+    def _send_frame(self, frame: CanFrame, unix_s: float) -> None:
         # Data in one word, as socketcand itself does (its document shows spaces); without any, two spaces.
         self._say(f"frame {frame.id:03X} {unix_s:.6f} {frame.data.hex().upper()}")
 
@@ -337,8 +331,8 @@ _Command = Callable[[SocketcandSession, list[str], float], None]
 _BOTH: Final[dict[str, _Command]] = {
     "send": SocketcandSession._send,  # noqa: SLF001
     "echo": SocketcandSession._echo,  # noqa: SLF001
-    "rawmode": SocketcandSession._raw_mode,  # noqa: SLF001
-    "bcmmode": SocketcandSession._bcm_mode,  # noqa: SLF001
+    "rawmode": lambda self, *given: self._change_mode(Mode.RAW, *given),
+    "bcmmode": lambda self, *given: self._change_mode(Mode.BCM, *given),
 }
 _COMMANDS: Final[dict[Mode, dict[str, _Command]]] = {
     Mode.NO_BUS: {"open": SocketcandSession._open, "echo": SocketcandSession._echo},  # noqa: SLF001

@@ -11,7 +11,7 @@ import contextlib
 import math
 import socket
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
@@ -113,10 +113,6 @@ class SocketcandServer:
             if client.slow:
                 self.stats.slow += 1
                 writer.transport.abort()  # or what it does not read would be kept
-
-    def figures(self) -> dict[str, int]:
-        """Return the statistics by name."""
-        return asdict(self.stats)
 
 
 class _Client:

@@ -1,21 +1,39 @@
-"""What the monitor knows of a bus: what was said, each node's rates, the load now. Sans-IO."""
+"""The data of the monitor: messages, each node's rates and the current load. Sans-IO."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from canbus_tools.bus.bus_load import LoadMeter
+from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.frame import Frame, FrameKind
 from canbus_tools.protocol.protocol import owner_of
 from canbus_tools.protocol.traffic import NodeTraffic
+from nodes.dictionary.dictionary import Dictionary
 
 HISTORY: Final = 120
-"""Loads that are remembered."""
+"""Number of loads that are kept."""
 SPAN_S: Final = 2.0
-"""Rates are means over so long."""
+"""Rates are averaged over this time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MonitorOptions:
+    """What to show of which bus."""
+
+    bus: BusOptions
+    bitrate: int
+    """Bit rate to calculate the load with."""
+    bitrate_is_known: bool
+    filter_text: str = ""
+    dictionaries: Mapping[int, Dictionary]
+    fetch: tuple[str, ...] = ()
+    lines: bool = True
+    as_json: bool = False
+    duration_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,7 +46,7 @@ class NodeRates:
     bytes_to: float
     bytes_from: float
     load: float
-    """Share of the bus that its frames took, 0..1."""
+    """Share of the bus used by its frames, 0..1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +61,7 @@ class BusRates:
 
 
 class _Totals:
-    """Counters at one moment, from which rates are differences."""
+    """Counters at one time; rates are differences of them."""
 
     def __init__(self, now_s: float, watch: "BusWatch") -> None:
         self.now_s = now_s
@@ -65,7 +83,7 @@ _NOTHING: Final = (0, 0, 0, 0, 0)
 
 
 class BusWatch:
-    """Takes a bus's frames. ``update`` now and then, with the time that goes on without frames too."""
+    """Evaluates the frames of a bus. Call ``update`` regularly, also without frames."""
 
     def __init__(self, decoder: BusDecoder, meter: LoadMeter, now_s: float) -> None:
         self.decoder = decoder
@@ -74,11 +92,11 @@ class BusWatch:
         self.bits = 0
         self.node_bits: dict[int, int] = {}
         self.loads: deque[float] = deque(maxlen=HISTORY)
-        """Of the bus between updates, the last one last."""
+        """Load of the bus between updates, the latest last."""
         self._moments: deque[_Totals] = deque([_Totals(now_s, self)])
 
     def feed(self, frame: Frame) -> Sequence[Decoded]:
-        """Take the next frame; returns what it said."""
+        """Take the next frame and return what it contained."""
         bits = self.meter.feed(frame)
         self.frames += 1
         self.bits += bits
@@ -88,7 +106,7 @@ class BusWatch:
         return self.decoder.feed(frame)
 
     def update(self, now_s: float) -> BusRates:
-        """Return the rates until NOW_S, a steady clock's."""
+        """Return the rates until NOW_S, of a monotonic clock."""
         latest = _Totals(now_s, self)
         before = self._moments[-1]
         passed_s = now_s - before.now_s

@@ -14,22 +14,21 @@ from textual.containers import Vertical
 from textual.widgets import DataTable, Footer, Input, RichLog, Static
 
 from canbus_tools.bus.computer import Computer, Listener, now_s
-from canbus_tools.monitor.bus_watch import BusRates, BusWatch
-from canbus_tools.monitor.options import MonitorOptions
-from canbus_tools.monitor.text import COLUMNS, bar_line, cells, log_line, read_filter
+from canbus_tools.monitor.bus_watch import BusRates, BusWatch, MonitorOptions
+from canbus_tools.monitor.text import COLUMNS, bar_line, cells, log_line
 from canbus_tools.protocol.decoded import Decoded, Kind
-from canbus_tools.protocol.filters import Filter
+from canbus_tools.protocol.filters import read_filter
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError
 
 REFRESH_S: Final = 0.25
 KEPT: Final = 20_000
-"""Things said that are kept, for another filter to look at."""
+"""Number of messages that are kept, for a change of the filter."""
 LOG_LINES: Final = 2_000
 LOG_FRAME: Final = 3
-"""Columns of padding and scroll bar."""
+"""Width of padding and scroll bar."""
 LINES_AT_ONCE: Final = 60
-"""Lines added at one refresh: a screenful. Nobody reads more in REFRESH_S; how many were left out is said."""
+"""Most lines added by one refresh, about a screenful; a line reports how many were omitted."""
 
 
 class MonitorScreen(App[None]):
@@ -57,33 +56,30 @@ class MonitorScreen(App[None]):
         Binding("ctrl+c", "quit", "Quit", show=False, priority=True),
     ]
 
-    def __init__(
-        self, computer: Computer, options: "MonitorOptions", watch: BusWatch, queue: Listener
-    ) -> None:
+    def __init__(self, computer: Computer, options: MonitorOptions, watch: BusWatch, queue: Listener) -> None:
         super().__init__()
         self.failure: CanductorError | None = None
         self.terminated = False
-        """SIGTERM came."""
+        """Whether SIGTERM was received."""
         self.shown = 0
-        """Lines put into the log."""
+        """Number of lines written to the log."""
         self._computer = computer
         self._options = options
         self._watch = watch
         self._queue = queue
-        self._filter = options.filter_
+        self._filter = read_filter(options.filter_text)
         self._filter_text = options.filter_text
         self._acks = False
         self._paused = False
         self._said: deque[Decoded] = deque(maxlen=KEPT)
         self._unshown = 0
-        """Came while the log was paused."""
-        self._left_out = 0
+        """Number of messages while the log was paused."""
         self._columns: tuple[str, ...] = ()
         self._width = 80
         self._end_s = None if options.duration_s is None else now_s(computer) + options.duration_s
 
     def compose(self) -> ComposeResult:
-        """Make the widgets."""
+        """Create the widgets."""
         with Vertical():
             yield Static(id="load")
             yield DataTable(id="nodes", cursor_type="none", zebra_stripes=False)
@@ -93,13 +89,13 @@ class MonitorScreen(App[None]):
         yield Footer()
 
     def on_mount(self) -> None:
-        """Begin."""
+        """Start the screen."""
         self.theme = "textual-dark"
         log = self.query_one("#log", RichLog)
         log.can_focus = True
         log.focus()
         self.set_interval(REFRESH_S, self.refresh_now)
-        # Left to the command line, it would end the program before the terminal is as it was.
+        # The command line's handler would end the program before the terminal is restored.
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._terminate)
 
     def _terminate(self) -> None:
@@ -118,8 +114,8 @@ class MonitorScreen(App[None]):
     # --------------------------------------------------------------------------------------------- refreshing
 
     def refresh_now(self) -> None:
-        """Take what came, and show it."""
-        if len(self.query("#load, #state, #nodes, #log")) < 4:  # it is ending: the timer outlives them
+        """Show what was received."""
+        if len(self.query("#load, #state, #nodes, #log")) < 4:  # the timer may outlive the widgets
             return
         try:
             frames = self._queue.take()
@@ -150,10 +146,7 @@ class MonitorScreen(App[None]):
         log = self.query_one("#log", RichLog)
         left_out = len(said) - LINES_AT_ONCE
         if left_out > 0:
-            self._left_out += left_out
-            log.write(
-                Text(f"… {left_out} more, too fast to show: filter with /, or use --lines", "dim italic")
-            )
+            log.write(Text(f"… {left_out} more omitted: filter with /, or use --lines", "dim italic"))
         for item in said[-LINES_AT_ONCE:]:
             log.write(log_line(item, self._width - LOG_FRAME))
         self.shown += min(len(said), LINES_AT_ONCE)
@@ -199,7 +192,7 @@ class MonitorScreen(App[None]):
         if self._paused:
             text.append("PAUSED", "bold yellow")
             text.append(f", {self._unshown} since   ")
-        text.append(f"filter: {self._filter_text}")
+        text.append(f"filter: {self._filter_text or 'none'}")
         text.append("   acks shown" if self._acks else "")
         nodes = self._watch.decoder.nodes.values()
         strangers = sorted(node.nodeid for node in nodes if not node.dictionary_origin)
@@ -210,20 +203,20 @@ class MonitorScreen(App[None]):
         if guessed:
             text.append(f"   dictionary of {', '.join(map(str, guessed))} guessed", "yellow")
         if not self._watch.frames:
-            text.append("   nothing heard yet: is anybody talking on this bus?", "yellow")
+            text.append("   no frame received yet: check that nodes and host are running", "yellow")
         return text
 
     # --------------------------------------------------------------------------------------------------- keys
 
     def action_pause(self) -> None:
-        """Stop or go on with the log; figures go on."""
+        """Pause or resume the log, but not the figures."""
         self._paused = not self._paused
         self.query_one("#log", RichLog).auto_scroll = not self._paused
         if not self._paused:
             self._rewrite()
 
     def action_acks(self) -> None:
-        """Show acknowledgements too, or not."""
+        """Show or hide acknowledgements."""
         self._acks = not self._acks
         self._rewrite()
 
@@ -234,31 +227,31 @@ class MonitorScreen(App[None]):
         self.query_one("#log", RichLog).clear()
 
     def action_ask_filter(self) -> None:
-        """Ask for a filter."""
+        """Open the filter's input."""
         entry = self.query_one("#filter", Input)
         entry.add_class("asked")
         entry.focus()
 
     def action_leave_filter(self) -> None:
-        """Keep the filter as it was."""
+        """Close the input without a change."""
         self.query_one("#filter", Input).remove_class("asked")
         self.query_one("#log", RichLog).focus()
 
     @on(Input.Submitted, "#filter")
     def take_filter(self, submitted: Input.Submitted) -> None:
-        """Use the filter that was typed."""
+        """Use the filter that was entered."""
         text = " ".join(submitted.value.split())
         try:
-            self._filter = read_filter(text) if text else Filter()
+            self._filter = read_filter(text)
         except UsageError as error:
             self.notify(str(error), severity="error")
             return
-        self._filter_text = text or "none"
+        self._filter_text = text
         self.action_leave_filter()
         self._rewrite()
 
     def _rewrite(self) -> None:
-        """Fill the log anew from what is kept."""
+        """Fill the log again from the messages kept."""
         self._unshown = 0
         log = self.query_one("#log", RichLog)
         log.clear()

@@ -1,4 +1,4 @@
-"""What the monitor's screen writes: the lines of its head, table and log, and the words of its filter."""
+"""Text of the monitor's screen: the lines of its head, table and log."""
 
 import math
 import textwrap
@@ -9,18 +9,14 @@ from typing import Final, Literal
 
 from rich.text import Text
 
-from canbus_tools.monitor.bus_watch import BusRates, BusWatch, NodeRates
-from canbus_tools.monitor.options import MonitorOptions
+from canbus_tools.monitor.bus_watch import BusRates, BusWatch, MonitorOptions, NodeRates
 from canbus_tools.protocol.decoded import Decoded, Kind
-from canbus_tools.protocol.filters import ALL, Filter
 from canbus_tools.protocol.protocol import Direction
-from nodes.support.can_protocol import DATA_NODEID_MAX
-from nodes.support.option_values import UsageError, parse_int
 
 BUSY, FULL = 0.5, 0.8
-"""Loads from which the bar is yellow, and red."""
+"""Loads from which the bar is yellow or red."""
 ROOM_MIN: Final = 20
-"""Characters of a line that the text has on the narrowest screen."""
+"""Characters for the text of a line on the narrowest screen."""
 _EIGHTHS: Final = " ▏▎▍▌▋▊▉"
 _SPARKS: Final = "▁▂▃▄▅▆▇█"
 _STYLES: Final[Mapping[Kind, str]] = {
@@ -37,7 +33,7 @@ _STYLES: Final[Mapping[Kind, str]] = {
 # ----------------------------------------------------------------------------------------------------- head
 
 
-def bar_line(options: "MonitorOptions", watch: BusWatch, rates: BusRates, dropped: int, width: int) -> Text:
+def bar_line(options: MonitorOptions, watch: BusWatch, rates: BusRates, dropped: int, width: int) -> Text:
     """Return the two lines of the head, WIDTH characters wide."""
     load = watch.meter.load()
     right = f" {rates.load:5.1%}  mean {load.mean:.1%}  peak {load.peak:.1%}"
@@ -80,11 +76,11 @@ class Column:
     heading: str
     width: int
     importance: int
-    """Lower stays longer on a narrow screen."""
+    """Columns with high numbers are the first to be hidden on a narrow screen."""
     text: Callable[[NodeRates], str]
     justify: Literal["left", "right"] = "right"
     alarming: bool = False
-    """Anything but 0 is trouble."""
+    """Whether any value but 0 is highlighted."""
 
 
 def _time_text(time_s: float) -> str:
@@ -149,57 +145,17 @@ def cells(rates: NodeRates, columns: tuple[str, ...]) -> list[Text]:
 
 
 def log_line(said: Decoded, width: int) -> Text:
-    """Return an entry of the log, WIDTH wide: local time, node and way, and text in lines enough."""
+    """Return an entry of the log, WIDTH wide: local time, node, direction and wrapped text."""
     text = Text(no_wrap=True)
     seconds = said.time_s % 60
     clock = time.strftime("%H:%M", time.localtime(said.time_s)) if 0 <= said.time_s < 1 << 33 else "--:--"
     text.append(f"{clock}:{seconds:09.6f} ", "dim")
+    style = "cyan" if said.direction is Direction.TO_NODE else "green"
     arrow = {Direction.TO_NODE: "→", Direction.FROM_NODE: "←"}.get(said.direction, " ")
-    text.append(f"{'' if said.nodeid is None else said.nodeid:>3} {arrow} ", _way_style(said))
+    text.append(f"{'' if said.nodeid is None else said.nodeid:>3} {arrow} ", style)
     room = max(ROOM_MIN, width - len(text))
     pieces = textwrap.wrap(said.text, room, break_on_hyphens=False) or [""]
     text.append(("\n" + " " * len(text)).join(pieces), _STYLES.get(said.kind, ""))
     if said.repeated:
         text.append("  repeated", "yellow")
     return text
-
-
-def _way_style(said: Decoded) -> str:
-    return "cyan" if said.direction is Direction.TO_NODE else "green"
-
-
-# --------------------------------------------------------------------------------------------------- filter
-
-
-def read_filter(text: str) -> Filter:
-    """Read ``node=4,5 kind=nak dir=to get_* stats``; raises UsageError."""
-    nodes: list[int] = []
-    kinds: set[Kind] = set()
-    messages: list[str] = []
-    direction: Direction | None = None
-    for word in text.split():
-        key, equals, value = word.partition("=")
-        if not equals:
-            messages.append(word)
-        elif key == "node":
-            nodes += [parse_int(part, 1, DATA_NODEID_MAX, name="node") for part in value.split(",")]
-        elif key == "kind":
-            kinds |= _kinds(value)
-        elif key in ("dir", "direction") and value in ("to", "from"):
-            direction = Direction(value)
-        else:
-            raise UsageError(f"'{word}' is no filter; write node=4 kind=nak dir=to (or from) get_*")
-    return Filter(nodes or None, messages or None, direction, kinds or None)
-
-
-def _kinds(value: str) -> set[Kind]:
-    found: set[Kind] = set()
-    for word in value.split(","):
-        if word == ALL:
-            return set(Kind)
-        if word not in [kind.value for kind in Kind]:
-            raise UsageError(
-                f"there is no kind '{word}'; there are {', '.join(k.value for k in Kind)}, {ALL}"
-            )
-        found.add(Kind(word))
-    return found

@@ -1,7 +1,7 @@
-"""Blocks out of the payloads of one data id, as an onlooker wants them: every sound one, whatever precedes.
+"""Extracts every valid block from the payloads of one data id, for listening tools.
 
-A node discards up to the next sync byte after an error, so that a lost frame costs it a whole sound block.
-An onlooker need not: it tries every place in the damaged stretch.
+After an error, a node discards bytes up to the next sync byte and so loses a valid block. A listening tool
+need not: it tries every offset in the damaged bytes.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ GAP_S: Final = 0.1
 nodes give it up then anyway, but an onlooker's times are those of its own machine, which may have been busy.
 """
 NOISE_SHOWN: Final = 64
-"""Bytes of noise that are told at once."""
+"""Most bytes of noise in one report."""
 _MIN: Final[int] = lib.WIRE_BLOCK_MIN
 _MAX: Final[int] = lib.WIRE_BLOCK_MAX
 _MARK: Final[int] = lib.WIRE_SEQ_MARK >> 4
@@ -43,7 +43,7 @@ class BlockStream:
 
     def __init__(self, way: DirectionTraffic) -> None:
         self._way = way
-        self._noise = bytearray()  # not told yet
+        self._noise = bytearray()  # not yet reported
         self._held = b""
         self._last = Frame(0.0, 0, b"")
         self._scanner: Any = ffi.new("struct wire_scanner *")
@@ -72,7 +72,7 @@ class BlockStream:
         """Give up waiting: return what can be read of what is held."""
         found = self._cut(self._held, last=True)
         if self._noise:
-            self._tell_noise(found)
+            self._report_noise(found)
         return self._take(found, self._last)
 
     def _take(self, found: Sequence[bytes], frame: Frame) -> Sequence[Decoded]:
@@ -91,7 +91,7 @@ class BlockStream:
             outcome = _scan(self._scanner, data, len(data), self._skip, self._length)
             if outcome == _BLOCK:
                 if self._noise:
-                    self._tell_noise(found)
+                    self._report_noise(found)
                 start = self._skip[0]
                 end = start + self._length[0]
                 found.append(data[start:end])
@@ -112,17 +112,17 @@ class BlockStream:
     def _drop(self, found: list[bytes], noise: bytes) -> None:
         self._noise += noise
         if len(self._noise) >= NOISE_SHOWN:
-            self._tell_noise(found)
+            self._report_noise(found)
 
-    def _tell_noise(self, found: list[bytes]) -> None:
+    def _report_noise(self, found: list[bytes]) -> None:
         found.append(Noise(self._noise))
         self._noise.clear()
 
     def _sound_block_at(self, data: bytes) -> int:
         """Return where a sound block begins behind the first byte, 0: nowhere.
 
-        What looks like the beginning of a block after noise may be more noise, and then nobody wants to wait
-        for the rest of it with the next block in hand.
+        After noise, the apparent start of a block may be noise too; then a complete block must not wait for
+        the rest of it.
         """
         for at in range(1, len(data) - _MIN + 1):
             if data[at + 1] >> 4 != _MARK or not _MIN <= data[at] <= len(data) - at:

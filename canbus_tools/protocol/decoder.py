@@ -1,8 +1,8 @@
-"""What is said on one CAN bus, read from its frames by names. Sans-IO.
+"""Decodes the frames of one CAN bus to named messages. Sans-IO.
 
-``BusDecoder.feed`` takes every frame of a bus in the order of time and returns what it said: usually nothing
-yet (a block takes several frames), sometimes several commands. Whatever comes, it never raises, and what it
-keeps is bounded by the 255 nodes a bus can have.
+``BusDecoder.feed`` takes every frame of a bus in order and returns the messages that it completes: usually
+none (a block takes several frames), sometimes several. It never raises; its memory is bounded by the 255
+nodes of a bus.
 """
 
 from collections.abc import Mapping, Sequence
@@ -186,7 +186,7 @@ class _Stream(BlockStream):
         return dictionary
 
     def _learns_from(self, content: bytes, time_s: float) -> bool:
-        """Take a block that cannot be read; tells whether that made a dictionary known by which it can."""
+        """Take an unreadable block; return whether a dictionary was found that explains it."""
         before = self._known.get(self._node.nodeid)
         known = self._dictionaries.unread(self._node.nodeid, self.direction, content, time_s)
         if before is not self._known.get(self._node.nodeid):
@@ -209,7 +209,6 @@ class _CommandStream(_Stream):
     def _block(self, out: list[Decoded], block: bytes, frame: Frame) -> None:
         node = self._node
         time_s, channel = frame[0], frame[4]
-        node.last_sent_s = time_s
         seq = block[1] & SEQUENCE_MASK
         repeated = node.flow.sent(block, time_s)
         content = block[2:-3]
@@ -271,7 +270,7 @@ class _ResponseStream(_Stream):
             self._learn(said, read[0])
 
     def _learn(self, shape: Shape, values: Sequence[Value]) -> None:
-        """Take what a response tells about the node itself."""
+        """Evaluate a response with information about the node."""
         params = dict(zip(shape.names, values, strict=True))
         offset, data, uuid = params.get("offset"), params.get("data"), params.get("canbus_uuid")
         if isinstance(offset, int) and isinstance(data, bytes):

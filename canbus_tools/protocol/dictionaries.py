@@ -93,7 +93,7 @@ class DictionarySource:
         return bool(fitting)
 
     def is_open(self, nodeid: int) -> bool:
-        """Tell whether a dictionary is not known yet that the cache may have."""
+        """Return whether the dictionary is unknown, but may be in the cache."""
         guess = self._guesses.get(nodeid)
         return nodeid not in self.known and guess is not None and guess.is_open
 

@@ -13,7 +13,7 @@ CLASSES: Final = {
     0x004: "controller problem",
     0x008: "protocol violation",
     0x010: "transceiver problem",
-    0x020: "no acknowledgement: nobody else hears this adapter",
+    0x020: "no acknowledgement: no other node receives this adapter's frames",
     0x040: "bus off: the adapter took itself off the bus",
     0x080: "bus error",
     0x100: "restarted after bus off",

@@ -1,4 +1,4 @@
-"""Which of the things said on a bus a tool shows."""
+"""Filters: which messages and frames a tool shows."""
 
 import argparse
 import re
@@ -9,14 +9,14 @@ from typing import Final
 from canbus_tools.protocol.decoded import Decoded, Kind
 from canbus_tools.protocol.protocol import Direction
 from nodes.support.can_protocol import DATA_NODEID_MAX
-from nodes.support.option_values import UsageError, integer
+from nodes.support.option_values import UsageError, integer, parse_int
 
 ALL: Final = "all"
 DEFAULT_KINDS: Final = frozenset(Kind) - {Kind.ACK}
 
 
 class Filter:
-    """Says of each thing whether to show it. ``None`` stands for everything, but acks for KINDS."""
+    """Selects what to show. ``None``: everything; as KINDS, everything but acks."""
 
     def __init__(
         self,
@@ -32,7 +32,7 @@ class Filter:
         self._kinds = DEFAULT_KINDS if kinds is None else frozenset(kinds)
 
     def passes(self, said: Decoded) -> bool:
-        """Tell whether to show it."""
+        """Return whether to show SAID."""
         return (
             said.kind in self._kinds
             and (self._nodes is None or said.nodeid in self._nodes)
@@ -41,8 +41,37 @@ class Filter:
         )
 
 
+def read_filter(text: str) -> Filter:
+    """Read ``node=4,5 kind=nak dir=to get_* stats``; raises UsageError."""
+    nodes: list[int] = []
+    kinds: set[Kind] = set()
+    messages: list[str] = []
+    direction: Direction | None = None
+    for word in text.split():
+        key, equals, value = word.partition("=")
+        if not equals:
+            messages.append(word)
+        elif key == "node":
+            nodes += [parse_int(part, 1, DATA_NODEID_MAX, name="node") for part in value.split(",")]
+        elif key == "kind":
+            kinds |= _kinds(value)
+        elif key in ("dir", "direction") and value in ("to", "from"):
+            direction = Direction(value)
+        else:
+            raise UsageError(f"'{word}' is not a filter; write node=4 kind=nak dir=to (or from) get_*")
+    return Filter(nodes or None, messages or None, direction, kinds or None)
+
+
+def _kinds(value: str) -> set[Kind]:
+    words = value.split(",")
+    known = [*(kind.value for kind in Kind), ALL]
+    if unknown := set(words).difference(known):
+        raise UsageError(f"unknown kind '{unknown.pop()}'; the kinds are {', '.join(known)}")
+    return set(Kind) if ALL in words else {Kind(word) for word in words}
+
+
 def declare_filter(command: argparse.ArgumentParser) -> None:
-    """Add the options that say what to show."""
+    """Add the options that select what to show."""
     add = command.add_argument
     add(
         "--node",
@@ -66,10 +95,12 @@ def declare_filter(command: argparse.ArgumentParser) -> None:
     )
 
 
-def given_filter(given: argparse.Namespace) -> Filter:
-    """Return what ``declare_filter`` declared; raises UsageError."""
-    if given.message and not all(given.message):
-        raise UsageError("--message is empty; give a name as a dictionary has it, such as get_clock")
-    kinds = given.kind and (set(Kind) if ALL in given.kind else {Kind(kind) for kind in given.kind})
-    direction = Direction(given.direction) if given.direction else None
-    return Filter(given.node, given.message, direction, kinds)
+def given_filter(given: argparse.Namespace) -> str:
+    """Return the options of ``declare_filter`` as the text that ``read_filter`` reads; raises UsageError."""
+    for name in given.message or ():
+        if not name or "=" in name or " " in name:
+            raise UsageError(f"--message is '{name}', must be a message's name, such as get_clock or get_*")
+    words = [f"node={','.join(map(str, given.node))}"] if given.node else []
+    words += [f"kind={','.join(given.kind)}"] if given.kind else []
+    words += [f"dir={given.direction}"] if given.direction else []
+    return " ".join([*words, *(given.message or ())])

@@ -1,7 +1,7 @@
-"""A node's flow control as an onlooker sees it: what is repeated, refused and missing, and how long it takes.
+"""A node's flow control from listening: repeated, refused and missing blocks, and round trips. Sans-IO.
 
-The onlooker knows less than either end: frames may be missing from a recording that the node received, and
-the other way round. Where that leaves two readings, the likelier one is counted. Sans-IO.
+Frames that the node received may be missing from a recording, and vice versa. In ambiguous cases the more
+probable explanation is counted.
 """
 
 import math
@@ -73,16 +73,16 @@ class Flow:
         self.restart()
 
     def restart(self) -> None:
-        """Forget where the numbers stand: the node begins anew."""
+        """Forget all block numbers: the node starts again."""
         self._next: int | None = None
-        self._flight: dict[int, float | None] = {}  # in order of sending; None: repeated, tells no round trip
+        self._flight: dict[int, float | None] = {}  # in order of sending; None: repeated, gives no round trip
         self._gaps: dict[int, int] = {}  # by number: how many before it were not seen, if the node takes it
         self._before: list[tuple[bytes, float] | None] = [None] * (SEQUENCE_MASK + 1)
         self._answered: int | None = None
         self._empty: int | None = None
 
     def sent(self, block: bytes, now_s: float) -> bool:
-        """Take a block to the node; tells whether it is a repeat."""
+        """Take a block to the node; return whether it is a repeat."""
         number = block[1] & SEQUENCE_MASK
         before = self._before[number]
         self._before[number] = (block, now_s)
@@ -102,7 +102,7 @@ class Flow:
         return False
 
     def answered(self, block: bytes, now_s: float) -> bool:
-        """Take a block from the node; tells whether it refuses one (nak) that was sent."""
+        """Take a block from the node; return whether it is a nak."""
         following = block[1] & SEQUENCE_MASK
         last = (following - 1) & SEQUENCE_MASK
         before, self._answered = self._answered, following
@@ -128,10 +128,10 @@ class Flow:
         return True
 
     def _lose_count(self, *, first: bool, following: int, empty: bool) -> bool:
-        """Take an answer that names no block under way; tells whether it is a nak.
+        """Take an answer for no block in flight; return whether it is a nak.
 
-        Either the node had another number in mind than a host that just came, which will go on with the one
-        it is told, or much is missing from the recording.
+        Either a new host started with another number than the node expects, or frames are missing from the
+        recording.
         """
         self._next = None
         self._flight.clear()

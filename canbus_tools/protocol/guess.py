@@ -61,7 +61,7 @@ class _Candidate:
         self.heard: set[tuple[Direction, int, str]] = set()
         """Numbers of messages, and what they are called here."""
         self._clock: tuple[float, int] | None = None
-        """When the node's clock was told last, and what it was."""
+        """Time and value of the node's last clock report."""
         try:
             self._clock_hz = dictionary.clock_freq_hz
         except DictionaryError:

@@ -1,4 +1,4 @@
-"""How the tools write what was said on a bus, and each node's counters, as plain text."""
+"""Plain text of decoded messages and of each node's counters."""
 
 import math
 from collections.abc import Iterable
@@ -7,6 +7,7 @@ from functools import lru_cache
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.protocol import Direction
 from canbus_tools.protocol.traffic import NodeTraffic
+from canbus_tools.support.text_table import table
 
 _ENDS = {Direction.TO_NODE: "to", Direction.FROM_NODE: "from", Direction.ANY: "from"}
 _NOBODY = {Direction.TO_NODE: "to all", Direction.FROM_NODE: "from ?", Direction.ANY: "-"}
@@ -18,7 +19,7 @@ _WORDS = {
 
 
 def line_of(said: Decoded) -> str:
-    """Return time, bus, whom it goes to or comes from, and the text; without the line's end."""
+    """Return a line with time, bus, receiver or sender and the text, without the line's end."""
     time_s, channel, nodeid, direction, _, _, repeated, shape, values = said
     again = "  (repeated)" if repeated else ""
     return f"{time_s:.6f}  {printable(channel)}  {_WORDS[nodeid, direction]}  {shape.text(values)}{again}"
@@ -35,7 +36,7 @@ _HEADINGS = ("node", "uuid", "mcu", "frames", "to", "from", "repeated", "missed"
 
 def table_of(nodes: Iterable[NodeTraffic]) -> str:
     """Return each node's counters as lines with a heading; to and from count messages."""
-    rows: list[tuple[str, ...]] = [(*_HEADINGS, "round trip (median, p99)")]
+    rows: list[tuple[str, ...]] = []
     for node in nodes:
         ways = (node.to_node, node.from_node)
         cells = (
@@ -52,18 +53,10 @@ def table_of(nodes: Iterable[NodeTraffic]) -> str:
             round_trip_text(node),
         )
         rows.append(tuple(map(str, cells)))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+    return "\n".join(table((*_HEADINGS, "round trip (median, p99)"), rows, indent=""))
 
 
 def round_trip_text(node: NodeTraffic) -> str:
     """Return the median and the 99th percentile of a node's round trips."""
     median_s, p99_s = (node.flow.round_trips.quantile_s(share) for share in (0.5, 0.99))
-    return "-" if math.isnan(median_s) else f"{milliseconds(median_s)}, {milliseconds(p99_s)}"
-
-
-def milliseconds(time_s: float) -> str:
-    """Return a time with three digits that count."""
-    return f"{time_s * 1e3:.3g} ms"
+    return "-" if math.isnan(median_s) else f"{median_s * 1e3:.3g} ms, {p99_s * 1e3:.3g} ms"

@@ -1,7 +1,7 @@
-"""What travels on the bus, described once: ids, admin and signal frames, message blocks.
+"""The protocol on the bus, described once: ids, admin and signal frames, message blocks.
 
-The decoder reads frames by these tables, and the Wireshark dissector is generated from them. Nothing here
-acts; the project's own nodes and hosts take the same numbers from ``nodes.bus.assign`` and ``firmware/wire``.
+The decoder reads frames by these tables, and the Wireshark dissector is generated from them. The project's
+own nodes and hosts take the same numbers from ``nodes.support.can_protocol`` and ``firmware/wire``.
 """
 
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
-from nodes.dictionary.message_format import CONTENT_MAX
+from nodes.support._wire import lib
 from nodes.support.can_protocol import (
     ADMIN_ID,
     ADMIN_RESPONSE_ID,
@@ -31,14 +31,14 @@ from nodes.support.can_protocol import (
 
 
 class Direction(Enum):
-    """Which way a frame goes."""
+    """Direction of a frame."""
 
     TO_NODE = "to"
     FROM_NODE = "from"
     ANY = "any"
     """The host and every node may send it."""
 
-    __hash__ = object.__hash__  # Enum's own is a Python function, and runs thousands of times a second
+    __hash__ = object.__hash__  # Enum's own is a slow Python function
 
 
 # -------------------------------------------------------------------------------------------------------- ids
@@ -61,7 +61,7 @@ def owner_of(can_id: int) -> tuple[int, Direction] | None:
 
 
 class FieldKind(Enum):
-    """How the bytes of a field are to be read."""
+    """Encoding of a field."""
 
     UNSIGNED = "unsigned, little-endian"
     HEX = "unsigned, little-endian, shown in hex"
@@ -77,17 +77,17 @@ class Field:
     """Bytes."""
     kind: FieldKind = FieldKind.UNSIGNED
     sentence: str = ""
-    """What it means."""
+    """Its meaning."""
     values: Mapping[int, str] = field(default_factory=dict)
-    """Names of values, where it is an enumeration."""
+    """Names of values, if it is an enumeration."""
 
     def read(self, data: bytes, at: int) -> int | bytes:
-        """Return the value that stands at AT of DATA, which is long enough."""
+        """Return the value at offset AT of DATA, which is long enough."""
         raw = data[at : at + self.size]
         return raw if self.kind is FieldKind.UUID else int.from_bytes(raw, "little")
 
     def text(self, value: int | bytes) -> str:
-        """Return a value as users see it."""
+        """Return a value as text."""
         if isinstance(value, bytes):
             return value.hex()
         digits = f"0x{value:02x}" if self.kind is FieldKind.HEX else str(value)
@@ -96,30 +96,30 @@ class Field:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameFormat:
-    """A frame that is a whole message by itself."""
+    """A frame that is a complete message."""
 
     name: str
     direction: Direction
     can_id: int
-    """The first id it has."""
+    """Its first id."""
     ids: int = 1
-    """How many ids in a row it may have."""
+    """Number of consecutive ids that it may have."""
     command: int | None = None
-    """Its first byte, which tells it from others of the same id; None: the id alone tells."""
+    """Its first byte, which distinguishes it from others of the same id; None: the id alone does."""
     fields: tuple[Field, ...] = ()
-    """What follows, from the second byte on where there is a command, else from the first."""
+    """From the second byte on if there is a command, else from the first."""
     extension: bool = False
-    """Only firmware of this project knows it; Klipper's ignores it."""
+    """Whether only firmware of this project knows it; Klipper's ignores it."""
     sentence: str = ""
 
     @property
     def size(self) -> int:
-        """Bytes of a whole frame; what may follow them means nothing."""
+        """Bytes of a complete frame; further bytes have no meaning."""
         return self.fields_at + sum(f.size for f in self.fields)
 
     @property
     def fields_at(self) -> int:
-        """Where the first field stands."""
+        """Offset of the first field."""
         return 0 if self.command is None else 1
 
 
@@ -151,7 +151,7 @@ ADMIN_FRAMES: Final = (
         can_id=ADMIN_ID,
         command=REQUEST_BOOTLOADER,
         fields=(_UUID,),
-        sentence="Tells a node to restart into its bootloader.",
+        sentence="Makes a node restart into its bootloader.",
     ),
     FrameFormat(
         name="set_nodeid_bootloader",
@@ -190,7 +190,7 @@ ADMIN_FRAMES: Final = (
                 size=1,
                 kind=FieldKind.HEX,
                 values=_SET_COMMANDS,
-                sentence="the command that sets its id, which tells what runs on it",
+                sentence="the command that sets its id, which identifies what runs on it",
             ),
         ),
         sentence="This node waits for an id.",
@@ -205,7 +205,7 @@ ADMIN_FRAMES: Final = (
         sentence="This node has an id.",
     ),
 )
-"""Frames that give out node ids and synchronise clocks; told apart by their id and first byte."""
+"""Frames that assign node ids and synchronise clocks; distinguished by their id and first byte."""
 
 SIGNAL_FRAMES: Final = (
     FrameFormat(
@@ -237,11 +237,11 @@ SIGNAL_FRAMES: Final = (
         sentence="A trsync triggered: every node whose trsync joined the group stops at once.",
     ),
 )
-"""Frames from node to node with ids that win against all data."""
+"""Frames from node to node, with ids of higher priority than all data."""
 
 
 def frame_format(can_id: int, data: bytes) -> FrameFormat | None:
-    """Return the format of an admin or signal frame that is whole; None when it is none."""
+    """Return the format of a complete admin or signal frame; None for any other frame."""
     first = data[0] if data else None
     for known in _BY_ID.get(can_id, ()):
         if known.command in (None, first) and len(data) >= known.size:
@@ -254,33 +254,16 @@ for _frame in (*ADMIN_FRAMES, *SIGNAL_FRAMES):
     for _id in range(_frame.can_id, _frame.can_id + _frame.ids):
         _BY_ID.setdefault(_id, []).append(_frame)
 
+BLOCK: Final[Mapping[str, int]] = {
+    "length_min": lib.WIRE_BLOCK_MIN,
+    "length_max": lib.WIRE_BLOCK_MAX,
+    "sequence_mark": lib.WIRE_SEQ_MARK,
+    "content_at": lib.WIRE_HEADER,
+    "crc_polynomial": 0x8408,
+    "crc_start": 0xFFFF,
+    "sync": lib.WIRE_SYNC,
+}
+"""Numbers of a message block (firmware/wire/wire.h): ``<length> <sequence> <content> <crc, 2 bytes> <sync>``.
 
-# ----------------------------------------------------------------------------------------------------- blocks
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BlockFormat:
-    """A message block: ``<length> <sequence> <content> <crc high> <crc low> <sync>``.
-
-    The payloads of the frames with one data id make one stream of bytes; a block may begin and end anywhere
-    in a frame. To a node a block carries commands, from it one response; an empty one acknowledges.
-    """
-
-    length_min: int = 5
-    """Of the whole block; its first byte."""
-    length_max: int = CONTENT_MAX + 5
-    sequence_mark: int = 0x10
-    """The high half of the second byte."""
-    sequence_mask: int = 0x0F
-    """The low half: to a node the block's number modulo 16, from a node the number it expects next."""
-    content_at: int = 2
-    crc_before_end: int = 3
-    """The checksum's high byte stands that far from the end."""
-    crc_polynomial: int = 0x8408
-    """CRC-16/MCRF4XX, least significant bit first: 0x1021 reflected."""
-    crc_start: int = 0xFFFF
-    sync: int = 0x7E
-    """The last byte. Further ones between blocks mean nothing."""
-
-
-BLOCK: Final = BlockFormat()
+The checksum is CRC-16/MCRF4XX, least significant bit first: the polynomial 0x1021, reflected.
+"""

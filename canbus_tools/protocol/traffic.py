@@ -1,4 +1,4 @@
-"""Counters of one node's traffic, as an onlooker counts it."""
+"""Counters of one node's traffic, from listening."""
 
 import math
 from collections.abc import Iterable
@@ -13,16 +13,16 @@ class DirectionTraffic:
     def __init__(self) -> None:
         self.frames = 0
         self.bytes = 0
-        """Of payload."""
+        """Bytes of payload."""
         self.blocks = 0
         self.messages = 0
         """Commands or responses; repeated ones count once."""
         self.unknown_messages = 0
         """Blocks with a message that could not be read: no dictionary, or another firmware's."""
         self.invalid_bytes = 0
-        """Payload that made no block."""
+        """Bytes of payload that are not part of a block."""
         self.noises = 0
-        """Stretches of such bytes."""
+        """Sequences of such bytes."""
 
     def to_json(self) -> dict[str, int]:
         """Return all counters."""
@@ -30,12 +30,12 @@ class DirectionTraffic:
 
 
 class NodeTraffic:
-    """What is known of one node by listening."""
+    """What listening shows about one node."""
 
     def __init__(self, nodeid: int) -> None:
         self.nodeid = nodeid
         self.uuid: str | None = None
-        """As admin frames or the node itself said; None: nobody did."""
+        """From admin frames or the node; None: unknown."""
         self.mcu = ""
         self.version = ""
         self.dictionary_origin = ""
@@ -44,11 +44,10 @@ class NodeTraffic:
         self.from_node = DirectionTraffic()
         self.flow = Flow()
         self.last_heard_s = math.nan
-        """When the node's last frame came."""
-        self.last_sent_s = math.nan
+        """Time of the node's last frame."""
 
     def take_dictionary(self, dictionaries: DictionarySource) -> None:
-        """Take over what the node's dictionary says about it."""
+        """Set the fields that come from the node's dictionary."""
         dictionary = dictionaries.known.get(self.nodeid)
         self.dictionary_origin = dictionaries.origins.get(self.nodeid, "")
         alike = dictionaries.fitting.get(self.nodeid) or ((dictionary,) if dictionary else ())
@@ -57,13 +56,13 @@ class NodeTraffic:
 
     @property
     def guess(self) -> str | None:
-        """A sentence about the node's dictionary when that is a guess."""
+        """A sentence about the node's dictionary if it is a guess."""
         if self.dictionary_origin != GUESSED:
             return None
         what = " ".join(filter(None, (self.mcu, self.version))) or "one of several"
         return (
-            f"node {self.nodeid}: its dictionary ({what}) is guessed: the cache has it, and it explains what "
-            f"was heard; --dictionary {self.nodeid}=FILE makes sure"
+            f"node {self.nodeid}: its dictionary ({what}) is guessed: a dictionary in the cache explains its "
+            f"traffic; give --dictionary {self.nodeid}=FILE to be certain"
         )
 
     def to_json(self) -> dict[str, object]:
@@ -85,6 +84,6 @@ class NodeTraffic:
 
 
 def _common(texts: Iterable[str]) -> str:
-    """Return what all of them say, or nothing: of a guess only what all that fit say is told."""
+    """Return the text that all of TEXTS are, or an empty one."""
     different = set(texts)
     return different.pop() if len(different) == 1 else ""

@@ -1,6 +1,6 @@
-"""Logs of can-utils' candump: the form that ``candump -l`` and ``-L`` write, and the one on a screen.
+"""Logs of can-utils' candump: the formats of ``candump -l`` and ``-L``, and of its screen output.
 
-Any bytes may come; a file is read as fast as a live pipe is followed.
+Accepts any bytes; reads files and live pipes.
 """
 
 import re
@@ -12,7 +12,7 @@ from nodes.support.errors import CanductorError
 
 CHUNK: Final = 1 << 16
 LINE_MAX: Final = 1000
-"""Characters; the longest frame, of CAN FD, takes some 180."""
+"""Characters; the longest frame, of CAN FD, has about 180."""
 ERROR_FLAG: Final = 0x2000_0000
 _HEX_ID: Final = r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
 _LOG: Final = re.compile(
@@ -31,10 +31,9 @@ _new: Final = tuple.__new__
 def read_candump(
     source: BinaryIO, name: str, before_read: Callable[[], object] | None = None
 ) -> Iterator[list[Frame]]:
-    """Yield the frames of SOURCE, called NAME, as they come, many at once where there are many.
+    """Yield the frames of SOURCE as they come, in lists. NAME is for messages.
 
-    BEFORE_READ is called whenever more input is to be read. Raises CanductorError at the end when there were
-    lines that are no frames.
+    BEFORE_READ is called before each read. Raises CanductorError at the end if there were invalid lines.
     """
     read = getattr(source, "read1", source.read)  # does not wait for a whole chunk
     tail, lines_before = "", 0
@@ -47,7 +46,7 @@ def read_candump(
         lines = (tail + chunk.decode("latin-1")).split("\n")
         tail = lines.pop() if chunk else ""
         if len(tail) > LINE_MAX:
-            tail = tail[:LINE_MAX]  # no frame: it is told with the line's end
+            tail = tail[:LINE_MAX]  # invalid; reported with the line's end
         frames: list[Frame] = []
         for number in _parse(lines, frames):
             bad_count += 1
@@ -59,15 +58,15 @@ def read_candump(
         if not chunk:
             break
     if bad:
-        others = f", nor are {bad_count - 1} others" if bad_count > 1 else ""
+        others = f", and {bad_count - 1} further lines are invalid" if bad_count > 1 else ""
         raise CanductorError(f"{name}: {bad[0]} is no frame of a candump log{others}; the rest was read")
 
 
 def _parse(lines: Iterable[str], frames: list[Frame]) -> list[int]:
-    """Append what LINES hold to FRAMES; return the numbers of those that hold no frame, from 1."""
+    """Append the frames of LINES to FRAMES; return the numbers of invalid lines, from 1."""
     bad: list[int] = []
     for number, line in enumerate(lines, 1):
-        try:  # the usual line, without a call
+        try:  # fast path for the usual form
             stamp, channel, said = line.split()
             can_id, mark, digits = said.partition("#")
             time_s = float(stamp[1:-1])
@@ -110,17 +109,10 @@ def _rare_frame(line: str) -> Frame | None:
 
 
 def candump_line(frame: Frame) -> str:
-    """Return a frame as ``candump -l`` writes it, with the line's end."""
+    """Return the line of ``candump -l`` for a frame."""
     channel = "".join(frame.channel.split()) or "can0"
     data = frame.data.hex().upper()
-    if frame.kind is FrameKind.DATA:
-        said = f"{frame.can_id:03X}#{data}"
-    elif frame.kind is FrameKind.ERROR:
-        said = f"{frame.can_id | ERROR_FLAG:08X}#{data}"
-    elif frame.kind is FrameKind.REMOTE:
-        said = f"{frame.can_id:0{3 if frame.can_id <= 0x7FF else 8}X}#R"
-    elif frame.kind is FrameKind.FD:
-        said = f"{frame.can_id:0{3 if frame.can_id <= 0x7FF else 8}X}##0{data}"
-    else:
-        said = f"{frame.can_id:08X}#{data}"
-    return f"({frame.time_s:.6f}) {channel} {said}\n"
+    bits = frame.can_id | (ERROR_FLAG if frame.kind is FrameKind.ERROR else 0)
+    digits = 8 if bits > 0x7FF or frame.kind is FrameKind.EXTENDED else 3
+    content = {FrameKind.REMOTE: "#R", FrameKind.FD: f"##0{data}"}.get(frame.kind, f"#{data}")
+    return f"({frame.time_s:.6f}) {channel} {bits:0{digits}X}{content}\n"

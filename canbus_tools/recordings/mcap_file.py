@@ -1,6 +1,6 @@
-"""MCAP files, which Foxglove Studio opens: frames, what they say, and counters, each a channel of JSON.
+"""MCAP files, which Foxglove Studio opens: frames, decoded messages and counters, as channels of JSON.
 
-Times are those of the frames. What the writer holds back is one chunk (1 MB) and an index entry per chunk.
+Times are those of the frames. The writer buffers one chunk (1 MB) and an index entry per chunk.
 """
 
 import json
@@ -99,15 +99,15 @@ class McapWriter:
         self._add(FRAMES, frame.time_s, values)
 
     def said(self, said: Decoded) -> None:
-        """Add what a frame said."""
+        """Add a decoded message."""
         self._add(MESSAGES, said.time_s, {"nodeid": -1, **json_of(said)})
 
     def counters(self, time_s: float, values: Mapping[str, object]) -> None:
-        """Add the counters as they stand."""
+        """Add the current counters."""
         self._add(COUNTERS, time_s, values)
 
     def finish(self) -> None:
-        """Write what is held back, and the index."""
+        """Write the last chunk and the index."""
         self._writer.finish()  # type: ignore[no-untyped-call]
 
     def _add(self, topic: str, time_s: float, values: Mapping[str, object]) -> None:
@@ -117,15 +117,15 @@ class McapWriter:
 
 
 def nanoseconds(time_s: float) -> int:
-    """Return a frame's time as MCAP has it; 0 for times that it cannot have."""
+    """Return a frame's time for MCAP; 0 for times out of its range."""
     if not 0 <= time_s < _TIME_END_S:
         return 0
     whole_s = int(time_s)
-    return whole_s * _NS + round((time_s - whole_s) * _NS)  # a float of nanoseconds has no room for them
+    return whole_s * _NS + round((time_s - whole_s) * _NS)  # a float of ns is not exact
 
 
 def json_of(said: Decoded) -> dict[str, Any]:
-    """Return what was said as JSON has it; without ``nodeid`` when it is not about one node."""
+    """Return a decoded message as JSON values; without ``nodeid`` if it is not about one node."""
     values: dict[str, Any] = {"bus": said.channel}
     if said.nodeid is not None:
         values["nodeid"] = said.nodeid
@@ -140,8 +140,13 @@ def json_of(said: Decoded) -> dict[str, Any]:
     }
 
 
+def json_line(said: Decoded) -> str:
+    """Return a line with one JSON object."""
+    return json.dumps({"time_s": said.time_s, **json_of(said)}, separators=(",", ":"))
+
+
 def read_mcap(source: BinaryIO, name: str) -> Iterator[Frame]:
-    """Yield the frames of a recording that McapWriter wrote; raises CanductorError where it is broken."""
+    """Yield the frames of a recording by McapWriter; raises CanductorError where it is damaged."""
     count = 0
     channels: set[int] = set()
     try:
@@ -151,16 +156,16 @@ def read_mcap(source: BinaryIO, name: str) -> Iterator[Frame]:
             elif isinstance(record, Message) and record.channel_id in channels:
                 yield _frame(record)
                 count += 1
-    # The reader's decompressors raise errors of their own, without a common type.
+    # The reader's decompressors raise their own errors, without a common type.
     except Exception as error:
         said = str(error) if isinstance(error, McapError | ValueError) else type(error).__name__
         raise CanductorError(
-            f"{name}: is broken or cut off behind frame {count} ({said or type(error).__name__});"
-            " the frames before that were read"
+            f"{name}: damaged or truncated after frame {count} ({said or type(error).__name__});"
+            " the frames before were read"
         ) from error
     if not channels:
         raise CanductorError(
-            f"{name}: has no channel {FRAMES} with frames; was it recorded by 'canductor can'?"
+            f"{name}: has no channel {FRAMES} with frames; give a recording of 'canductor can record'"
         )
 
 

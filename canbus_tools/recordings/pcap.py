@@ -1,7 +1,7 @@
 """Captures of tcpdump and Wireshark: pcap and pcapng with CAN frames, any byte order and time resolution.
 
-Two link types carry CAN: SocketCAN's own, with the id in network byte order, and Linux "cooked" captures (of
-all interfaces at once), with the id in the capturing machine's. Packets of anything else are passed over.
+Two link types carry CAN: SocketCAN, with the id in network byte order, and Linux "cooked" captures (of all
+interfaces), with the id in the byte order of the capturing machine. Other packets are skipped.
 """
 
 import struct
@@ -15,7 +15,7 @@ SOCKETCAN: Final = 227
 COOKED: Final = 113
 COOKED_2: Final = 276
 PACKET_MAX: Final = 1 << 18
-"""Bytes; libpcap's own bound."""
+"""Bytes; the limit of libpcap."""
 PCAP_MAGICS: Final = {
     b"\xa1\xb2\xc3\xd4": (">", 1e-6),
     b"\xd4\xc3\xb2\xa1": ("<", 1e-6),
@@ -29,7 +29,7 @@ _HEADER: Final = 8
 
 
 def can_frame(link: int, packet: bytes, time_s: float, channel: str, order: str) -> Frame | None:
-    """Read a captured packet; None when it is no CAN frame. ORDER is the capturing machine's."""
+    """Read a captured packet; None: not a CAN frame. ORDER is that of the capturing machine."""
     if link == COOKED:
         protocol_at, at = 14, 16
     elif link == COOKED_2:
@@ -60,7 +60,7 @@ def _kind(bits: int, length: int, size: int) -> FrameKind:
 
 
 class _File:
-    """A capture being read, knowing where it is."""
+    """A capture that is read, and the position in it."""
 
     def __init__(self, source: BinaryIO, name: str) -> None:
         self.name = name
@@ -72,7 +72,7 @@ class _File:
         data = self._source.read(size)
         self.at += len(data)
         if len(data) < size:
-            raise self.broken("ends in the middle of a packet")
+            raise self.broken("truncated packet")
         return data
 
     def take_or_end(self, size: int) -> bytes | None:
@@ -85,7 +85,7 @@ class _File:
 
     def broken(self, what: str) -> CanductorError:
         return CanductorError(
-            f"{self.name}: {what} at byte {self.at}; {self.frames} frames before it were read"
+            f"{self.name}: {what} at byte {self.at}; the {self.frames} frames before were read"
         )
 
     def frame(self, frame: Frame | None) -> Iterator[Frame]:
@@ -95,7 +95,7 @@ class _File:
 
 
 def read_pcap(source: BinaryIO, name: str) -> Iterator[Frame]:
-    """Yield the frames of a pcap file; raises CanductorError where it is broken."""
+    """Yield the frames of a pcap file; raises CanductorError where it is damaged."""
     file = _File(source, name)
     order, unit_s = PCAP_MAGICS[file.take(4)]
     link = struct.unpack(order + "16xI", file.take(20))[0] & 0x0FFF_FFFF
@@ -104,14 +104,14 @@ def read_pcap(source: BinaryIO, name: str) -> Iterator[Frame]:
     while (raw := file.take_or_end(head.size)) is not None:
         seconds, fraction, size, _ = head.unpack(raw)
         if size > PACKET_MAX:
-            raise file.broken(f"has a packet of {size} bytes, which none can have,")
+            raise file.broken(f"impossible packet of {size} bytes")
         yield from file.frame(can_frame(link, file.take(size), seconds + fraction * unit_s, "", order))
 
 
 def _check_link(file: _File, link: int) -> None:
     if link not in (SOCKETCAN, COOKED, COOKED_2):
         raise CanductorError(
-            f"{file.name}: captured from something else than CAN (link type {link});"
+            f"{file.name}: not captured from a CAN bus (link type {link});"
             " capture a CAN interface, as in 'tcpdump -i can0 -w FILE'"
         )
 
@@ -134,20 +134,20 @@ class _Interface:
 
 
 def read_pcapng(source: BinaryIO, name: str) -> Iterator[Frame]:
-    """Yield the frames of a pcapng file; raises CanductorError where it is broken."""
+    """Yield the frames of a pcapng file; raises CanductorError where it is damaged."""
     file = _File(source, name)
     order = "<"
     interfaces: list[_Interface] = []
     while (raw := file.take_or_end(8)) is not None:
         kind, size = struct.unpack(order + "II", raw)
         body = b""
-        if kind == _SECTION:  # reads the same in both byte orders
+        if kind == _SECTION:  # the same number in both byte orders
             body = file.take(4)
             order = ">" if body == b"\x1a\x2b\x3c\x4d" else "<"
             size = struct.unpack(order + "I", raw[4:])[0]
             interfaces = []
         if size % 4 or not 12 + len(body) <= size <= PACKET_MAX + 1024:
-            raise file.broken(f"has a block of {size} bytes, which none can have,")
+            raise file.broken(f"impossible block of {size} bytes")
         body += file.take(size - 12 - len(body))
         file.take(4)
         try:
@@ -157,7 +157,7 @@ def read_pcapng(source: BinaryIO, name: str) -> Iterator[Frame]:
             elif kind in (_ENHANCED, _SIMPLE):
                 yield from file.frame(_packet(kind, body, interfaces, order))
         except (struct.error, IndexError):
-            raise file.broken("has a damaged block that ends") from None
+            raise file.broken("damaged block ending") from None
     if interfaces and not file.frames:
         for interface in interfaces:
             _check_link(file, interface.link)

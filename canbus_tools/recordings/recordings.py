@@ -1,6 +1,6 @@
-"""Reading recordings of CAN buses, whoever made them.
+"""Reading recordings of CAN buses in various formats.
 
-What was readable of a broken or truncated file is yielded; then one CanductorError tells where it breaks.
+The readable frames of a damaged or truncated file are yielded; then a CanductorError reports the place.
 """
 
 import sys
@@ -26,19 +26,19 @@ _TIME_END_S: Final = 1e12
 
 
 def read_frames(path: Path) -> Iterator[Frame]:
-    """Yield the frames of a file in the order they stand there; raises CanductorError.
+    """Yield the frames of a file in its order; raises CanductorError.
 
-    Knows candump logs, BLF, ASC, pcap, pcapng and MCAP by their content. PATH ``-`` is standard input, a
-    candump log.
+    Recognises candump logs, BLF, ASC, pcap, pcapng and MCAP by their content. PATH ``-``: a candump log from
+    standard input.
     """
     for frames in read_batches(path):
         yield from frames
 
 
 def read_batches(path: Path, before_read: Callable[[], object] | None = None) -> Iterator[list[Frame]]:
-    """Yield the frames as read_frames does, many at once: the quickest way to work on them.
+    """Yield the frames as read_frames does, but in lists, which is faster.
 
-    BEFORE_READ is called whenever more of a log is to be read.
+    BEFORE_READ is called before each read of a log.
     """
     if path == STANDARD_INPUT:
         yield from read_candump(sys.stdin.buffer, "standard input", before_read)
@@ -56,7 +56,7 @@ def read_batches(path: Path, before_read: Callable[[], object] | None = None) ->
 
 
 def _in_batches(frames: Iterator[Frame]) -> Iterator[list[Frame]]:
-    """Yield up to BATCH frames at once; what came before an error is yielded before it is raised."""
+    """Yield lists of up to BATCH frames; frames before an error are yielded before it is raised."""
     batch: list[Frame] = []
     try:
         for frame in frames:
@@ -73,7 +73,7 @@ def _in_batches(frames: Iterator[Frame]) -> Iterator[list[Frame]]:
 
 
 def _reader(file: BufferedReader, path: Path) -> Callable[[BinaryIO, str], Iterator[Frame]] | None:
-    """Return who reads such a file; None: it is taken for a candump log."""
+    """Return the reader for a file; None: it is read as a candump log."""
     start = file.peek(_MAGIC_SIZE)[:_MAGIC_SIZE]
     if start[:4] in pcap.PCAP_MAGICS:
         return pcap.read_pcap
@@ -89,7 +89,7 @@ def _reader(file: BufferedReader, path: Path) -> Callable[[BinaryIO, str], Itera
         raise CanductorError(f"{path}: is empty")
     if b"\0" in start:
         raise CanductorError(
-            f"{path}: is no recording this tool knows; it reads candump logs, BLF, ASC, pcap, pcapng and MCAP"
+            f"{path}: unknown format; candump logs, BLF, ASC, pcap, pcapng and MCAP can be read"
         )
     return None
 
@@ -103,10 +103,10 @@ def _read_blf(source: BinaryIO, name: str) -> Iterator[Frame]:
 
     size = Path(name).stat().st_size
     yield from _read_python_can(open_reader, name)
-    # A container that is cut off inflates to what there is of it, without a complaint.
+    # A truncated container inflates to what there is of it, without an error.
     if readers[0].file_size > size:
         raise CanductorError(
-            f"{name}: is cut off at byte {size} of {readers[0].file_size}; the frames before that were read"
+            f"{name}: truncated at byte {size} of {readers[0].file_size}; the frames before were read"
         )
 
 
@@ -123,9 +123,9 @@ def _read_python_can(open_reader: Callable[[], can.BLFReader | can.ASCReader], n
             if 0 <= frame.time_s < _TIME_END_S:
                 yield frame
                 count += 1
-    # Its readers raise whatever a damaged byte leads to: struct.error, zlib.error, KeyError, …
+    # Its readers raise various errors for damaged files: struct.error, zlib.error, KeyError, …
     except Exception as error:
         said = " ".join(str(error).split()) or type(error).__name__
         raise CanductorError(
-            f"{name}: is broken or cut off behind frame {count} ({said}); the frames before that were read"
+            f"{name}: damaged or truncated after frame {count} ({said}); the frames before were read"
         ) from error

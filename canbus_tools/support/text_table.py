@@ -1,4 +1,4 @@
-"""Plain tables: columns lined up by spaces, so that they read in any terminal, log or issue."""
+"""Plain text: tables with columns aligned by spaces, counts and paragraphs."""
 
 import re
 import textwrap
@@ -10,8 +10,8 @@ _HARD_SPACE: Final = "\0"
 
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
-    """Return the lines of a table; a column in which every row is empty is left out."""
-    kept = [n for n in range(len(headings)) if any(row[n] for row in rows)]
+    """Return the lines of a table; columns whose cells are all empty are omitted."""
+    kept = [n for n in range(len(headings)) if any(row[n] for row in rows) or not rows]
     lines = [[row[n] for n in kept] for row in (headings, *rows)]
     widths = [max(len(line[n]) for line in lines) for n in range(len(kept))]
     return [
@@ -21,12 +21,12 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[str]], indent: str = 
 
 
 def count(number: int, what: str, several: str = "") -> str:
-    """Return ``1 node``, ``2 nodes``; SEVERAL when the plural is no mere ``s``."""
+    """Return ``1 node``, ``2 nodes``; SEVERAL: the plural, if it is not WHAT with an ``s``."""
     return f"{number} {what if number == 1 else several or what + 's'}"
 
 
 def paragraph(text: str) -> list[str]:
-    """Return TEXT as lines that a terminal shows whole; a command in quotes is kept in one, to be copied."""
+    """Return TEXT wrapped for a terminal; a quoted command stays on one line, so that it can be copied."""
     kept = re.sub(r"'canductor [^']*'", lambda command: command[0].replace(" ", _HARD_SPACE), text)
     lines = textwrap.wrap(kept, WIDTH, break_long_words=False, break_on_hyphens=False)
     return [line.replace(_HARD_SPACE, " ") for line in lines]

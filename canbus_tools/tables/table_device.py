@@ -1,25 +1,21 @@
-"""Tables to drives and nodes at a device, without a coordinator: sends them, and tells who confirmed.
+"""Sends tables to drives and nodes at a device, without a coordinator, and reports who confirmed them.
 
-``canductor table send --device`` and its kin; coordinator/cli/commands/table_device.py has the options.
+For ``canductor table send --device`` and similar commands (coordinator/cli/commands/table_device.py).
 """
 
 import asyncio
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.link_facts import read_link
 from canbus_tools.bus.open_bus import BusOptions
-from canbus_tools.bus.talk import BusTalk, TalkError, refuse_if_in_use
-from canbus_tools.bus.uart_talk import open_uart_talk
+from canbus_tools.bus.talk import BusTalk, TalkError, open_uart_talk, refuse_if_in_use
 from canbus_tools.tables.table_nodes import (
-    Said,
-    TableTalk,
-    TalkBus,
-    ask_states,
+    NodeTables,
+    TableReport,
     judged,
     loop_ns,
     send_slowly,
@@ -29,37 +25,36 @@ from canbus_tools.tables.table_nodes import (
 from canbus_tools.tables.table_ways import Sent, send_blind
 from nodes.mt.cost import SerialCost
 from nodes.mt.device_job import DeviceJob, DeviceKind, Load
-from nodes.mt.download import DownloadOutcome, DownloadReport, DownloadTarget, download
+from nodes.mt.download import DownloadReport, DownloadTarget, download
 from nodes.mt.mt import WORD_BYTES
-from nodes.mt.table import AxleTable
 from nodes.support.errors import CanductorError
 
 _VIRTUAL: Final = "virtual"
 SLOW_TRIES: Final = 3
-"""Word by word, for axles whose nodes say that they missed some."""
+"""Transmissions word by word, for axles whose nodes report missing words."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceReport:
-    """What was sent, and who says what."""
+    """What was sent, and what the nodes report."""
 
     job: DeviceJob
     sent: tuple[Sent, ...]
-    """Where nobody confirms, and through registers."""
+    """Without confirmation, and through registers."""
     downloads: tuple[tuple[Load, DownloadReport], ...]
     """To nodes, by broadcast or link."""
-    said: tuple[Said, ...]
-    """By axle and node; empty where nobody confirms."""
+    reports: tuple[TableReport, ...]
+    """By axle and node; empty if no node was queried."""
 
     @property
     def ok(self) -> bool:
         """Whether nothing is known to have failed."""
-        return all(said.ok for said in self.said)
+        return all(report.ok for report in self.reports)
 
     @property
     def confirmed(self) -> bool | None:
-        """Whether every axle has its table; None: nobody can tell."""
-        return self.ok if self.said else None
+        """Whether every axle has its table; None: not known."""
+        return self.ok if self.reports else None
 
     def _bound_s(self, report: DownloadReport) -> float:
         return self._serial(report).bound_s if self.job.link else report.bound_s
@@ -96,11 +91,11 @@ class DeviceReport:
                 }
                 for load, report in self.downloads
             ],
-            "axles": [_said_json(said) for said in self.said],
+            "axles": [_report_json(report) for report in self.reports],
         }
 
     def to_text(self) -> str:
-        """Return the same for a reader."""
+        """Return the same as text."""
         lines = [
             f"{_load_text(sent.load)}: {sent.words} words in {sent.elapsed_s:.3f} s; the bound is "
             f"{sent.cost.bound_s:.3f} s: {sent.cost.text()}"
@@ -109,11 +104,11 @@ class DeviceReport:
         lines += [
             f"{_load_text(load)}: {report.text()}{self._line_text(report)}" for load, report in self.downloads
         ]
-        lines += [_said_text(said) for said in self.said]
+        lines += [_report_text(report) for report in self.reports]
         if self.confirmed is None:
             lines.append(
-                f"nobody confirmed it: what only listens on {self.job.device} cannot answer. Look at the "
-                "drive: its status must be 0 (ok), its length as many points as were sent"
+                f"not confirmed: receivers that only listen on {self.job.device} cannot answer. Check the "
+                "drive: its status must be 0 (ok), its length the number of points that were sent"
                 if self.sent
                 else f"no node of {self.job.device} has a table for these axles"
             )
@@ -129,30 +124,34 @@ def _load_text(load: Load) -> str:
     return f"{'axle' if len(load.axles) == 1 else 'axles'} {axles}: {len(load.pairs)} points"
 
 
-def _said_json(said: Said) -> Mapping[str, object]:
-    told: dict[str, object] = {"axle": said.axle, "node": said.node, "ok": said.ok, "problem": said.problem}
-    if said.state is not None:
-        told |= {
-            "status": said.state.status.name.lower(),
-            "generation": said.state.generation,
-            "points": said.state.length,
+def _report_json(report: TableReport) -> Mapping[str, object]:
+    values: dict[str, object] = {
+        "axle": report.axle,
+        "node": report.node,
+        "ok": report.ok,
+        "problem": report.problem,
+    }
+    if (state := report.state) is not None:
+        values |= {
+            "status": state.status.name.lower(),
+            "generation": state.generation,
+            "points": state.length,
         }
-    return told
+    return values
 
 
-def _said_text(said: Said) -> str:
-    text = f"  axle {said.axle}" + (f" on node {said.node}" if said.node else "")
-    if said.state is not None:
-        status = said.state.status.name.lower()
-        text += f": {status}, generation {said.state.generation}, {said.state.length} points"
-    return text + (("; " if said.state else ": ") + said.problem if said.problem else "")
+def _report_text(report: TableReport) -> str:
+    text = f"  axle {report.axle}" + (f" on node {report.node}" if report.node else "")
+    if (state := report.state) is not None:
+        text += f": {state.status.name.lower()}, generation {state.generation}, {state.length} points"
+    return text + (("; " if state else ": ") + report.problem if report.problem else "")
 
 
 # ------------------------------------------------------------------------------------------------ carry out
 
 
 def carry_out(computer: Computer, job: DeviceJob) -> DeviceReport:
-    """Do JOB; raises CanductorError when nothing of it can be done."""
+    """Do JOB; raises CanductorError if nothing of it can be done."""
     options = None
     if job.kind is DeviceKind.CAN:
         options = _bus_options(job)
@@ -160,7 +159,7 @@ def carry_out(computer: Computer, job: DeviceJob) -> DeviceReport:
     if not job.nodes and not job.link:
         if not job.loads:
             raise TalkError(
-                "only nodes can be asked: give --node ID for those on a CAN bus, --link on a serial line"
+                "only nodes can be queried: give --node ID on a CAN bus, or --link on a serial line"
             )
         return DeviceReport(job, send_blind(computer, job, options), (), ())
     return computer.run(_with_nodes(computer, job, options))
@@ -175,13 +174,13 @@ def _bus_options(job: DeviceJob) -> BusOptions:
 
 
 def _known_bitrate(options: BusOptions) -> int | None:
-    """Return what the kernel knows of an interface; None: a slow one is assumed."""
+    """Return the bit rate of an interface from the kernel; None: unknown, a low one is assumed."""
     if options.interface != "socketcan":
         return None
     try:
         return read_link(options.channel).bitrate
     except CanductorError:
-        return None  # the bus itself says what is wrong, when it is opened
+        return None  # opening the bus will report what is wrong
 
 
 async def _with_nodes(computer: Computer, job: DeviceJob, options: BusOptions | None) -> DeviceReport:
@@ -195,81 +194,73 @@ async def _with_nodes(computer: Computer, job: DeviceJob, options: BusOptions | 
                 await asyncio.gather(*(refuse_if_in_use(bus, nodeid) for nodeid in job.nodes))
             talks = [await stack.enter_async_context(bus.node(nodeid)) for nodeid in job.nodes]
         points = max((len(load.pairs) for load in job.loads), default=0)
-        nodes = [TableTalk(talk) for talk in talks]
-        places = [(node, await tables_on(node, job.axles, points)) for node in nodes]
+        places = [await tables_on(talk, job.axles, points) for talk in talks]
         if not job.loads:
-            return await _ask(job, places)
+            return DeviceReport(job, (), (), tuple(await _states(places, job.axles)))
         if job.delay_s is None:
-            return await _download(job, places, None if bus is None else TalkBus(bus))
+            return await _download(job, places, bus)
         return await _slowly(job, places, bus)
 
 
-_Tables = Sequence[tuple[TableTalk, Sequence[AxleTable]]]
+async def _states(places: Sequence[NodeTables], axles: Container[int]) -> list[TableReport]:
+    return [report for place in places for report in await place.states(axles)]
 
 
-async def _ask(job: DeviceJob, places: _Tables) -> DeviceReport:
-    said = [one for node, tables in places for one in await ask_states(node, tables)]
-    return DeviceReport(job, (), (), tuple(said))
-
-
-async def _download(job: DeviceJob, places: _Tables, bus: TalkBus | None) -> DeviceReport:
+async def _download(job: DeviceJob, places: Sequence[NodeTables], bus: BusTalk | None) -> DeviceReport:
     downloads: list[tuple[Load, DownloadReport]] = []
-    said: list[Said] = []
+    reports: list[TableReport] = []
     for load in job.loads:
-        meant = [
-            DownloadTarget(t, node, bus) for node, tables in places for t in tables if t.axle in load.axles
+        targets = [
+            DownloadTarget(table, place.node, bus)
+            for place in places
+            for table in place.tables
+            if table.axle in load.axles
         ]
-        said += _missing(load, (place.table.axle for place in meant))
-        if meant:
-            report = await download(load.pairs, meant, now_ns=loop_ns, share=job.share)
-            downloads.append((load, report))
-            said += [_of(outcome) for outcome in report.outcomes]
-    return DeviceReport(job, (), tuple(downloads), tuple(said))
+        reports += _missing(load, (target.table.axle for target in targets))
+        if targets:
+            result = await download(load.pairs, targets, now_ns=loop_ns, share=job.share)
+            downloads.append((load, result))
+            reports += [
+                TableReport(o.place.table.axle, o.place.node.name, o.state, o.problem)
+                for o in result.outcomes
+            ]
+    return DeviceReport(job, (), tuple(downloads), tuple(reports))
 
 
-def _of(outcome: DownloadOutcome) -> Said:
-    place = outcome.place
-    return Said(place.table.axle, place.node.name, outcome.state, outcome.problem)
-
-
-def _missing(load: Load, axles: Iterable[int]) -> list[Said]:
-    """Return those of LOAD that are not among AXLES, which some node has."""
+def _missing(load: Load, axles: Iterable[int]) -> list[TableReport]:
+    """Return a report for each axle of LOAD that is not among AXLES."""
+    problem = "none of the nodes has a table for it: add its node by --node, or configure that node"
     here = set(axles)
-    return [
-        Said(axle, "", None, "none of the nodes has a table for it: is it another node's, or not configured?")
-        for axle in load.axles
-        if axle not in here
-    ]
+    return [TableReport(axle, "", None, problem) for axle in load.axles if axle not in here]
 
 
-async def _slowly(job: DeviceJob, places: _Tables, bus: BusTalk | None) -> DeviceReport:
+async def _slowly(job: DeviceJob, places: Sequence[NodeTables], bus: BusTalk | None) -> DeviceReport:
     """Send word by word, T apart: by frames, or through the register of a node on a serial line."""
     sent: list[Sent] = []
-    said: list[Said] = []
+    reports: list[TableReport] = []
     for load in job.loads:
         found, left = {}, load
         for _ in range(SLOW_TRIES):
-            meant = [(node, [t for t in tables if t.axle in left.axles]) for node, tables in places]
-            before = [one for node, tables in meant for one in await ask_states(node, tables)]
+            before = await _states(places, left.axles)
             if not before:
                 break
-            sent.append(await _send_slowly(job, left, places[0][0], bus))
-            after = [one for node, tables in meant for one in await ask_states(node, tables)]
-            told = [judged(now, then, load) for now, then in zip(after, before, strict=True)]
-            found.update({(one.axle, one.node): one for one in told})
-            left = Load(tuple(dict.fromkeys(one.axle for one in told if not one.ok)), load.pairs)
+            sent.append(await _send_slowly(job, left, places[0], bus))
+            after = await _states(places, left.axles)
+            judgements = [judged(now, then, load) for now, then in zip(after, before, strict=True)]
+            found.update({(one.axle, one.node): one for one in judgements})
+            left = Load(tuple(dict.fromkeys(one.axle for one in judgements if not one.ok)), load.pairs)
             if not left.axles:
                 break
-        said += [*_missing(load, (axle for axle, _ in found)), *found.values()]
-    return DeviceReport(job, tuple(sent), (), tuple(said))
+        reports += [*_missing(load, [axle for axle, _ in found]), *found.values()]
+    return DeviceReport(job, tuple(sent), (), tuple(reports))
 
 
-async def _send_slowly(job: DeviceJob, load: Load, node: TableTalk, bus: BusTalk | None) -> Sent:
+async def _send_slowly(job: DeviceJob, load: Load, place: NodeTables, bus: BusTalk | None) -> Sent:
     assert job.delay_s is not None
     if bus is None:
-        return await write_register(node, load, job.delay_s)
-    return await send_slowly(load, job.delay_s, partial(_write_frame, bus, job.can_id))
+        return await write_register(place, load, job.delay_s)
 
+    async def write_frame(word: int) -> None:
+        bus.send_frame(job.can_id, word.to_bytes(WORD_BYTES, "little"))
 
-async def _write_frame(bus: BusTalk, can_id: int, word: int) -> None:
-    bus.send_frame(can_id, word.to_bytes(WORD_BYTES, "little"))
+    return await send_slowly(load, job.delay_s, write_frame)

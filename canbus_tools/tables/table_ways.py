@@ -50,7 +50,7 @@ class _Line(Protocol):
 
 
 class CanLine:
-    """A bus; what comes meanwhile is read, and counted: others' traffic tells what was left for us."""
+    """A bus; frames of others are read and counted, as they limit the share that is left."""
 
     def __init__(self, computer: Computer, bus: FrameLine, can_id: int) -> None:
         self.heard_bits = 0
@@ -106,7 +106,7 @@ class SerialLine:
             ) from None
 
     def pause_until(self, at_ns: int) -> None:
-        """Wait; nobody answers here."""
+        """Wait; there are no answers."""
         self._computer.sleep(max(0, at_ns - self._computer.monotonic_ns()) / NS_PER_S)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""``canductor console``: talk to one node in its own words, at a prompt or by a script."""
+"""``canductor console``: sends commands to one node, from a prompt or a script."""
 
 import argparse
 import contextlib
@@ -6,13 +6,12 @@ import os
 import re
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.bus.talk import BusTalk, NodeTalk, TalkError, refuse_if_in_use
-from canbus_tools.bus.uart_talk import open_uart_talk
+from canbus_tools.bus.talk import BusTalk, NodeTalk, TalkError, open_uart_talk, refuse_if_in_use
 from canbus_tools.console.prompt import prompt
 from canbus_tools.console.session import Quit, Session
 from canbus_tools.discovery.inventory import take_inventory
@@ -28,10 +27,10 @@ _UUID = re.compile(r"[0-9a-fA-F]{12}\Z")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConsoleOptions:
-    """Which node, and what to say to it."""
+    """A node, and the commands to send to it."""
 
     bus: BusOptions | None
-    """None: the UART."""
+    """None: use the UART."""
     node: str = ""
     uart: Path | None = None
     baud: int = BAUD_DEFAULT
@@ -58,7 +57,11 @@ def declare(command: argparse.ArgumentParser) -> None:
         metavar="BIT/S",
         help=f"baud rate of the serial device (default: {BAUD_DEFAULT})",
     )
-    add("--force", action="store_true", help="use the node even if another host uses it; that host loses it")
+    add(
+        "--force",
+        action="store_true",
+        help="use the node even if another host uses it; that host loses the node",
+    )
     add(
         "-e",
         "--execute",
@@ -107,7 +110,7 @@ def run_console(computer: Computer, options: ConsoleOptions) -> "ConsoleReport":
 
 @dataclass(frozen=True, slots=True)
 class ConsoleReport:
-    """How the session ended."""
+    """Figures of a session."""
 
     node: str
     firmware: str
@@ -116,16 +119,11 @@ class ConsoleReport:
     ok: bool = True
 
     def to_json(self) -> Mapping[str, object]:
-        """Return it."""
-        return {
-            "node": self.node,
-            "firmware": self.firmware,
-            "commands": self.commands,
-            "messages": self.messages,
-        }
+        """Return the figures."""
+        return asdict(self)
 
     def to_text(self) -> str:
-        """Return nothing: all has been shown."""
+        """Return nothing: everything was shown before."""
         return ""
 
 
@@ -154,7 +152,7 @@ async def _run_lines(session: Session, options: ConsoleOptions) -> None:
 
 
 def _lines(options: ConsoleOptions) -> Iterator[tuple[str, str]]:
-    """Yield each line of the script with where it is."""
+    """Yield each line of the script with its place."""
     if options.commands:
         for n, line in enumerate(options.commands, 1):
             yield f"--execute {n}", line
@@ -169,7 +167,7 @@ def _lines(options: ConsoleOptions) -> Iterator[tuple[str, str]]:
             for n, line in enumerate(lines, 1):
                 yield f"{name}:{n}", line
         except UnicodeDecodeError as error:
-            raise CanductorError(f"{name} is no text in UTF-8 ({error.reason})") from None
+            raise CanductorError(f"{name} is not UTF-8 text ({error.reason})") from None
         except OSError as error:
             raise CanductorError(f"{name} cannot be read ({error.strerror})") from None
 
@@ -180,9 +178,9 @@ def _say(text: str) -> None:
 
 
 def _history_file() -> Path:
-    """Return where lines are remembered (XDG_STATE_HOME)."""
+    """Return the file of earlier lines (XDG_STATE_HOME)."""
     base = os.environ.get("XDG_STATE_HOME", "")
-    # A relative path there is to be ignored, says the XDG Base Directory Specification.
+    # The XDG Base Directory Specification requires relative paths to be ignored.
     root = Path(base) if os.path.isabs(base) else Path.home() / ".local" / "state"  # noqa: PTH117
     return root / "canductor" / "console_history"
 
@@ -206,7 +204,7 @@ async def _open(computer: Computer, options: ConsoleOptions) -> AsyncIterator[No
 
 
 async def _nodeid(bus: BusTalk, node: str) -> int:
-    """Return the id of the node that was named; raises TalkError."""
+    """Return the id of a node given by its id or uuid; raises TalkError."""
     if not _UUID.match(node):
         return int(node)
     uuid = Uuid.parse(node.lower())
@@ -216,9 +214,11 @@ async def _nodeid(bus: BusTalk, node: str) -> int:
             f"{len(found)} boards on bus {bus.name} have the uuid {uuid} (cloned chips?); name one by its id"
         )
     if not found:
-        raise TalkError(f"no node on bus {bus.name} says that it is {uuid}; 'canductor can nodes' lists all")
+        raise TalkError(
+            f"no node on bus {bus.name} has the uuid {uuid}; 'canductor can nodes' lists all nodes"
+        )
     if found[0].nodeid is None:
         raise TalkError(
-            f"node {uuid} on bus {bus.name} waits for an id; give it one first with 'canductor can assign'"
+            f"node {uuid} on bus {bus.name} waits for an id; assign one first with 'canductor can assign'"
         )
     return found[0].nodeid

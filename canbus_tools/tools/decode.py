@@ -1,7 +1,6 @@
-"""``canductor can decode``: recordings of buses as lines of text."""
+"""``canductor can decode``: shows recordings of buses as text."""
 
 import argparse
-import json
 import re
 import select
 import sys
@@ -14,10 +13,10 @@ from canbus_tools.bus.until_stopped import StopFlag, stop_flag
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries
-from canbus_tools.protocol.filters import Filter, declare_filter, given_filter
+from canbus_tools.protocol.filters import Filter, declare_filter, given_filter, read_filter
 from canbus_tools.protocol.frame import Frame
 from canbus_tools.protocol.lines import line_of, printable, table_of
-from canbus_tools.recordings.mcap_file import json_of
+from canbus_tools.recordings.mcap_file import json_line
 from canbus_tools.recordings.recordings import STANDARD_INPUT, read_batches
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
@@ -27,21 +26,21 @@ from nodes.support.option_values import UsageError, existing_file
 LINES_HELD: Final = 500
 """Lines written at once."""
 LOOK_S: Final = 0.1
-"""How soon Ctrl-C is noticed while nothing comes in."""
+"""Interval of checks for Ctrl-C without input."""
 BUSES_MAX: Final = 64
-"""Names of buses that are distinguished; a file with more is no recording."""
+"""Most buses in a recording; a file with more is damaged."""
 _MOMENT: Final = re.compile(r"(\+?)(\d{1,12}(?:\.\d{1,9})?)\Z")
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A time in a recording, in seconds: as the recording counts, or from its first frame."""
+    """A time in a recording, in seconds of its own clock or relative to its first frame."""
 
     seconds: float
     relative: bool
 
     def at(self, first_s: float) -> float:
-        """Return it as the recording counts."""
+        """Return it as a time of the recording's clock."""
         return first_s + self.seconds if self.relative else self.seconds
 
 
@@ -57,7 +56,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     )
     declare_dictionaries(command)
     declare_filter(command)
-    moment = "in seconds as the recording counts them, or +SECONDS after its first frame"
+    moment = "in seconds of the recording's clock, or +SECONDS after its first frame"
     add("--since", type=_moment, metavar="TIME", help=f"start at this time, {moment}")
     add("--until", type=_moment, metavar="TIME", help="stop at this time")
     add("--summary", action="store_true", help="show only the counters of each node")
@@ -66,7 +65,7 @@ def declare(command: argparse.ArgumentParser) -> None:
 def make_job(given: argparse.Namespace) -> "Callable[[object], DecodeReport]":
     """Check what was given and return the job."""
     job = Decoding(
-        filter_=given_filter(given),
+        filter_=read_filter(given_filter(given)),
         dictionaries=given.dictionaries,
         since=given.since,
         until=given.until,
@@ -89,11 +88,11 @@ def _moment(text: str) -> Moment:
 
 
 class _StoppedError(Exception):
-    """The user stopped it while it waited for input."""
+    """The user ended it while it waited for input."""
 
 
 def _readable(file: BinaryIO) -> bool:
-    """Wait LOOK_S at most; true where nobody can wait for it."""
+    """Wait for input, LOOK_S at most; True also for files that select cannot wait for."""
     try:
         return bool(select.select([file], [], [], LOOK_S)[0])
     except (OSError, ValueError):
@@ -101,7 +100,7 @@ def _readable(file: BinaryIO) -> bool:
 
 
 class Decoding:
-    """Decodes recordings one after the other, as one: blocks may begin in one and end in the next."""
+    """Decodes recordings as one: a block may begin in one file and end in the next."""
 
     def __init__(
         self,
@@ -123,12 +122,12 @@ class Decoding:
         self._since, self._until = since, until
         self._begin_s = self._end_s = 0.0
         self._shows = lines
-        self._form = _json_line if as_json else line_of
+        self._form = json_line if as_json else line_of
         self._held: list[str] = []
         self._flag = StopFlag()
 
     def run(self, files: list[Path]) -> "DecodeReport":
-        """Decode FILES; lines go to standard output, sentences about what is broken to the report."""
+        """Decode FILES; lines go to standard output, errors to the report."""
         with stop_flag() as self._flag:
             for file in files:
                 if not self._flag.stopped:
@@ -136,7 +135,7 @@ class Decoding:
             for bus in self.buses.values():
                 self._take(bus.flush())
             self._write()
-        return DecodeReport(self, stopped=self._flag.stopped, lines=self._shows)
+        return DecodeReport(self, self._flag.stopped, self._shows)
 
     def _decode(self, file: Path) -> None:
         try:
@@ -151,7 +150,7 @@ class Decoding:
             self.problems.append(str(error))
 
     def _wait_for_input(self) -> None:
-        """Show what there is, and wait for a pipe so that Ctrl-C ends that and nothing else."""
+        """Write the lines so far, and wait for input; Ctrl-C ends only the waiting."""
         self._write()
         while not (self._flag.stopped or _readable(sys.stdin.buffer)):
             pass
@@ -161,8 +160,8 @@ class Decoding:
     def _feed(self, frames: Sequence[Frame]) -> bool:
         """Decode FRAMES; return whether the end was reached.
 
-        Step by step for all of them, not frame by frame: so each step stays in the processor's cache, which
-        makes it a quarter faster.
+        Each step handles all frames before the next step: that uses the processor's cache better and is a
+        quarter faster.
         """
         buses, end_s = self.buses, self._end_s
         found: list[Decoded] = []
@@ -185,7 +184,7 @@ class Decoding:
     def _new_bus(self, frame: Frame) -> BusDecoder:
         if len(self.buses) >= BUSES_MAX:
             raise CanductorError(
-                f"frame {self.frames}: more than {BUSES_MAX} buses in one recording; damaged?"
+                f"frame {self.frames}: more than {BUSES_MAX} buses in one recording; the file may be damaged"
             )
         decoder = BusDecoder(DictionarySource(self._dictionaries, self._cache))
         self.buses[frame.channel] = decoder
@@ -207,17 +206,13 @@ class Decoding:
         self._held.clear()
 
 
-def _json_line(said: Decoded) -> str:
-    return json.dumps({"time_s": said.time_s, **json_of(said)}, separators=(",", ":"))
-
-
+@dataclass(frozen=True, slots=True)
 class DecodeReport:
-    """What was decoded: every node's counters, and what could not be read."""
+    """Counters of every node, and what could not be read."""
 
-    def __init__(self, decoding: Decoding, *, stopped: bool, lines: bool) -> None:
-        self._decoding = decoding
-        self._stopped = stopped
-        self._lines = lines
+    _decoding: Decoding
+    _stopped: bool
+    _lines: bool
 
     @property
     def ok(self) -> bool:
@@ -260,8 +255,8 @@ class DecodeReport:
     def _hints(self) -> list[str]:
         nodes = [node for bus in self._decoding.buses.values() for node in bus.nodes.values()]
         return [guess for node in nodes if (guess := node.guess)] + [
-            f"node {node.nodeid}: {unread} of its blocks could not be read, its dictionary is not in the"
-            f" recording; give it with --dictionary {node.nodeid}=FILE"
+            f"node {node.nodeid}: {unread} of its blocks could not be read, as its dictionary is not in the "
+            f"recording; give it by --dictionary {node.nodeid}=FILE"
             for node in nodes
             if (unread := node.to_node.unknown_messages + node.from_node.unknown_messages)
             and not node.dictionary_origin

@@ -2,16 +2,16 @@
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.link_facts import LinkFacts, read_link
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.discovery.ask_bus import where
-from canbus_tools.doctor.facts import BusAddress, InterfaceFacts, NodeFacts, TrafficFacts
+from canbus_tools.bus.talk import on_bus
+from canbus_tools.doctor.facts import InterfaceFacts, NodeFacts, TrafficFacts
 from canbus_tools.doctor.finding import Finding, Severity, note, problem
-from canbus_tools.doctor.gather import BusListener, ask_nodes, fill_queue, read_interface, try_bitrates
+from canbus_tools.doctor.gather import BusListener, fill_queue, query_nodes, read_interface, try_bitrates
 from canbus_tools.doctor.interface import check_link, check_presence
 from canbus_tools.doctor.population import check_nodes
 from canbus_tools.doctor.traffic import check_traffic
@@ -21,8 +21,6 @@ from nodes.support.option_values import UsageError, decimal
 
 LISTEN_S: Final = 3.0
 LISTEN_S_MIN, LISTEN_S_MAX = 0.2, 600.0
-SYSTEMS_BITRATE: Final = ("socketcan", "canductor")
-"""Backends that have the bit rate they have."""
 
 
 def declare(command: argparse.ArgumentParser) -> None:
@@ -34,9 +32,9 @@ def declare(command: argparse.ArgumentParser) -> None:
         type=decimal(LISTEN_S_MIN, LISTEN_S_MAX, "s"),
         default=LISTEN_S,
         metavar="S",
-        help="how long to listen first, in seconds",
+        help="time to listen before sending, in seconds",
     )
-    add("--quiet-bus", action="store_true", help="send nothing: only listen and read the interface's state")
+    add("--quiet-bus", action="store_true", help="send nothing; only listen and read the interface's state")
     add(
         "--try-bitrates",
         action="store_true",
@@ -48,7 +46,7 @@ def make_job(given: argparse.Namespace) -> Callable[[Computer], "Diagnosis"]:
     """Check what was given; raises UsageError."""
     options = bus_options(given)
     if given.try_bitrates and given.quiet_bus:
-        raise UsageError("--try-bitrates is for a bus without nodes, which --quiet-bus does not look for")
+        raise UsageError("--try-bitrates needs to look for nodes, which --quiet-bus does not do")
     return lambda computer: examine(
         computer, options, given.listen, quiet=given.quiet_bus, try_others=given.try_bitrates
     )
@@ -62,104 +60,94 @@ def examine(
     quiet: bool = False,
     try_others: bool = False,
 ) -> "Diagnosis":
-    """Gather facts and judge them; what cannot be found out is a finding, too."""
+    """Gather facts and check them; what cannot be determined is a finding, too."""
     interface: InterfaceFacts | None = None
     findings: list[Finding] = []
     done: list[str] = []
-    place = BusAddress(name=options.name, words=where(options), socketcan=False, bitrate=options.bitrate)
-    if options.interface == "socketcan":
+    if options.is_socketcan:
         interface = read_interface(options.channel)
         findings = list(check_presence(interface))
-        bitrate = options.bitrate or (None if interface.link is None else interface.link.bitrate)
-        place = BusAddress(name=options.name, words=where(options), socketcan=True, bitrate=bitrate)
         done.append("interface")
         if findings:
-            return Diagnosis(place.name, tuple(findings), tuple(done))
+            return Diagnosis(options.name, tuple(findings), tuple(done))
+        assert interface.link is not None
+        options = replace(options, bitrate=options.bitrate or interface.link.bitrate)
         findings += check_link(interface)
     try:
-        traffic, nodes = _use_bus(computer, options, place, listen_s, quiet=quiet, try_others=try_others)
+        traffic, nodes = _use_bus(computer, options, listen_s, quiet=quiet, try_others=try_others)
     except CanductorError as error:
-        findings.append(_unusable(str(error), place))
-        return Diagnosis(place.name, tuple(findings), tuple(done))
+        findings.append(_unusable(str(error), options))
+        return Diagnosis(options.name, tuple(findings), tuple(done))
     done.append("traffic")
-    findings += check_traffic(traffic, interface, place)
+    findings += check_traffic(traffic, interface, options)
     if nodes is not None:
         done.append("nodes")
-        findings += check_nodes(nodes, place)
-        if try_others and place.socketcan and not nodes.inventory.entries:
-            findings.append(_try_by_hand(place.name))
-    if place.bitrate is None:
+        findings += check_nodes(nodes, options)
+        if try_others and options.is_socketcan and not nodes.inventory.entries:
+            findings.append(_try_by_hand(options.name))
+    if options.bitrate is None:
         findings.append(
             note(
                 "bitrate-unknown",
-                f"the bit rate of {place.name} is not known here",
+                f"the bit rate of {options.name} is not known here",
                 "the load of the bus cannot be computed",
-                "give it, such as --bitrate 1000000",
+                "give the bit rate, such as --bitrate 1000000",
             )
         )
-    return Diagnosis(place.name, tuple(findings), tuple(done), traffic, nodes)
+    return Diagnosis(options.name, tuple(findings), tuple(done), traffic, nodes)
 
 
 def _use_bus(
-    computer: Computer,
-    options: BusOptions,
-    place: BusAddress,
-    listen_s: float,
-    *,
-    quiet: bool,
-    try_others: bool,
+    computer: Computer, options: BusOptions, listen_s: float, *, quiet: bool, try_others: bool
 ) -> tuple[TrafficFacts, NodeFacts | None]:
-    opened = options
-    if options.interface in SYSTEMS_BITRATE:
-        opened = BusOptions(interface=options.interface, channel=options.channel)
+    opened = options.without_bitrate()
     nodes: NodeFacts | None = None
     queue_full = False
     before = _counters(options)
-    with BusListener(computer, opened, place.bitrate) as listener:
+    with BusListener(computer, opened, options.bitrate) as listener:
         listener.wait(listen_s)
-        listener.end_of_calm()
-        if place.socketcan and not quiet:
+        listener.start_of_queries()
+        if options.is_socketcan and not quiet:
             queue_full = fill_queue(opened)
-            # Error reports of what we send are the most telling; others have none, or but one handle.
-            nodes = computer.run(ask_nodes(computer, opened))
-    if not place.socketcan and not quiet:
-        nodes = computer.run(ask_nodes(computer, opened))
+            # Listens meanwhile for error reports; other backends have none, or can be opened only once.
+            nodes = on_bus(computer, opened, query_nodes)
+    if not options.is_socketcan and not quiet:
+        nodes = on_bus(computer, opened, query_nodes)
     traffic = listener.facts(before, _counters(options), queue_full=queue_full)
-    if nodes is not None and not nodes.inventory.entries and try_others and not place.socketcan:
+    if nodes is not None and not nodes.inventory.entries and try_others and not options.is_socketcan:
         nodes = NodeFacts(inventory=nodes.inventory, heard_at=try_bitrates(computer, options, listen_s))
     return traffic, nodes
 
 
 def _counters(options: BusOptions) -> LinkFacts | None:
-    return read_link(options.channel) if options.interface == "socketcan" else None
+    return read_link(options.channel) if options.is_socketcan else None
 
 
 def _try_by_hand(name: str) -> Finding:
     return note(
         "bitrates-by-hand",
         "other bit rates were not tried",
-        "the bit rate of a SocketCAN interface is the system's to change",
-        f"for 500000, 250000 and 1000000 in turn: sudo ip link set {name} down; sudo ip link set {name} up"
-        " type can"
-        f" bitrate 500000 listen-only on; then 'canductor can load -c {name}': at the right one there are"
-        " frames. At the end: listen-only off",
+        "only the system can change the bit rate of a SocketCAN interface",
+        f"for 500000, 250000 and 1000000 in turn: sudo ip link set {name} down; sudo ip link set {name} up "
+        f"type can bitrate 500000 listen-only on; then 'canductor can load -c {name}': at the right one "
+        "there are frames. At the end: listen-only off",
     )
 
 
-def _unusable(said: str, place: BusAddress) -> Finding:
-    if "ermission denied" in said or "not permitted" in said:
+def _unusable(message: str, bus: BusOptions) -> Finding:
+    if "ermission denied" in message or "not permitted" in message:
         return problem(
             "no-permission",
-            said,
+            message,
             "this user may not open the bus, so nothing more can be checked",
-            f"sudo canductor can doctor {place.words}; inside a container, give it the host's network and the"
+            f"sudo canductor can doctor {bus.arguments}; a container needs the host's network and the"
             " capability NET_RAW",
         )
     return problem(
         "bus-unusable",
-        said,
+        message,
         "the bus could not be used, so not everything was checked",
-        f"put right what is said there, and ask again: 'canductor can doctor {place.words}'",
+        f"correct that cause, then check again: 'canductor can doctor {bus.arguments}'",
     )
 
 
@@ -190,35 +178,19 @@ class Diagnosis:
         return {
             "bus": self.bus,
             "checked": list(self.checked),
-            "findings": [
-                {
-                    "name": finding.name,
-                    "severity": finding.severity.value,
-                    "seen": finding.seen,
-                    "means": finding.means,
-                    "do": finding.do,
-                }
-                for finding in self.sorted
-            ],
+            "findings": [asdict(finding) for finding in self.sorted],
             "load": load,
             "nodes": None if self.nodes is None else len(self.nodes.inventory.entries),
             "pings": [
-                {
-                    "nodeid": ping.nodeid,
-                    "asked": ping.asked,
-                    "repeats": ping.repeats,
-                    "lost": ping.lost,
-                    "invalid_bytes": ping.invalid_bytes,
-                    "rtt_median_s": round(ping.rtt_median_s, 6),
-                    "rtt_p99_s": round(ping.rtt_p99_s, 6),
-                }
+                asdict(ping)
+                | {"rtt_median_s": round(ping.rtt_median_s, 6), "rtt_p99_s": round(ping.rtt_p99_s, 6)}
                 for ping in pings
                 if ping.asked
             ],
         }
 
     def to_text(self) -> str:
-        """Return it as text to be read by people."""
+        """Return the findings as text."""
         lines = [f"{self.bus}: {self._summary()}"]
         for finding in self.sorted:
             lines += ["", f"{finding.severity.value.upper()} {finding.name}"]
@@ -234,18 +206,18 @@ class Diagnosis:
         }
         said = [count(number_of, severity.value) for severity, number_of in counts.items() if number_of]
         if not said and self.nodes is None and self.traffic is not None and not self.traffic.frames:
-            return "nothing was heard and nothing was asked, so no node was checked"
+            return "no frame was received and nothing was sent, so no node was checked"
         return ", ".join(said) or "nothing is wrong"
 
     def _figures(self) -> list[str]:
         lines = []
         if self.traffic is not None:
             load = self.traffic.load
-            busy = "how busy it is needs --bitrate" if load is None else f"{load.mean:.1%} busy"
+            busy = "load unknown without --bitrate" if load is None else f"load {load.mean:.1%}"
             lines.append(f"listened {self.traffic.listened_s:.1f} s: {busy}")
         pings = () if self.nodes is None else self.nodes.pings
         return lines + [
-            f"node {ping.nodeid}: {ping.asked} questions, {ping.repeats} repeated; round trip"
+            f"node {ping.nodeid}: {ping.asked} queries, {ping.repeats} repeated; round trip"
             f" {ping.rtt_median_s * 1000:.2f} ms median, {ping.rtt_p99_s * 1000:.2f} ms p99"
             for ping in pings
             if ping.asked

@@ -1,7 +1,7 @@
-"""``canductor can inject``: a virtual bus that goes wrong on purpose, for those who test a host or a board.
+"""``canductor can inject``: a virtual bus with faults, for tests of a host or a board.
 
-It runs the bus, nodes with the project's firmware when asked for, and a door for other CAN programs
-(socketcand), shows what happens meanwhile, and counts at the end.
+It runs the bus, optionally nodes with the project's firmware and a socketcand server for other CAN programs,
+shows the status, and prints figures at the end.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack, ExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Final, cast
 
@@ -182,7 +182,7 @@ class Injection:
             stats=self._stats or self._bus.stats,
             faults=tuple(words for words, _ in options.faults),
             nodes=figures,
-            socketcand=None if self._server is None else self._server.figures(),
+            socketcand=None if self._server is None else asdict(self._server.stats),
         )
 
     def _start_nodes(self, stack: ExitStack) -> None:

@@ -1,4 +1,4 @@
-"""``canductor can load``: how busy a bus is, and with what; live or from a recording."""
+"""``canductor can load``: the load of a bus and its causes, live or from a recording."""
 
 import argparse
 import contextlib
@@ -56,7 +56,12 @@ def declare(command: argparse.ArgumentParser) -> None:
         metavar="S",
         help="averaging window of peak and plot, in seconds",
     )
-    add("--plot", type=_plot, metavar="FILE", help="draw the load over time: .svg, or .png by rsvg-convert")
+    add(
+        "--plot",
+        type=lambda text: parse_path(text, ".svg", ".png"),
+        metavar="FILE",
+        help="draw the load over time: .svg, or .png (uses rsvg-convert)",
+    )
 
 
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "LoadReport"]:
@@ -80,21 +85,17 @@ def make_job(given: argparse.Namespace) -> Callable[[Computer], "LoadReport"]:
     )
 
 
-def _plot(text: str) -> Path:
-    return parse_path(text, ".svg", ".png")
-
-
 def find_bitrate(options: BusOptions) -> int:
     """Return the bit rate as given, or as the interface is set; raises CanductorError."""
     if options.bitrate is not None:
         return options.bitrate
-    if options.interface == "socketcan":
+    if options.is_socketcan:
         link = read_link(options.channel)
         if link.bitrate is not None:
             return link.bitrate
         raise CanductorError(
-            f"CAN bus {options.name}: a {link.kind or 'network'} interface has no bit rate; give the one to"
-            " reckon with, such as --bitrate 1000000"
+            f"CAN bus {options.name}: a {link.kind or 'network'} interface has no bit rate; give one to"
+            " calculate with, such as --bitrate 1000000"
         )
     raise CanductorError(
         f"CAN bus {options.name}: python-can does not report the bit rate; give it, such as --bitrate 1000000"
@@ -102,14 +103,14 @@ def find_bitrate(options: BusOptions) -> int:
 
 
 def measure_recording(path: Path, bitrate: int, window_s: float = WINDOW_S) -> LoadMeter:
-    """Measure a recording whole; raises CanductorError, also when it has frames of several buses."""
+    """Measure a recording; raises CanductorError, also if it has frames of several buses."""
     meter = LoadMeter(bitrate, window_s=window_s)
     channel: str | None = None
     for frame in read_frames(path):
         if channel not in (None, frame.channel):
             raise CanductorError(
-                f"{path} has frames of several buses ({channel}, {frame.channel}): together they have no"
-                " load; take them apart first, for instance by 'grep' of a candump log"
+                f"{path} has frames of several buses ({channel}, {frame.channel}); separate them first, for "
+                "example by 'grep' on a candump log"
             )
         channel = frame.channel
         meter.feed(frame)
@@ -126,9 +127,7 @@ def measure(
     """Measure a live bus for DURATION_S, or until Ctrl-C; raises CanductorError."""
     bitrate = find_bitrate(options)
     meter = LoadMeter(bitrate, window_s=window_s)
-    # The bit rate of a socketcan interface is the interface's business.
-    opened = BusOptions(interface=options.interface, channel=options.channel) if _is_set(options) else options
-    with computer.listen(opened) as bus, contextlib.suppress(KeyboardInterrupt):
+    with computer.listen(options.without_bitrate()) as bus, contextlib.suppress(KeyboardInterrupt):
         stamps = _Stamps(computer)
         end_s = None if duration_s is None else stamps.started_s + duration_s
         meter.begin(stamps.started_s)
@@ -141,14 +140,10 @@ def measure(
     return meter
 
 
-def _is_set(options: BusOptions) -> bool:
-    return options.interface in ("socketcan", "canductor")
-
-
 class _Stamps:
-    """Makes monotonic times of frames' times.
+    """Converts times of frames to monotonic times.
 
-    Some backends count those from elsewhere than Unix time: then the first one decides.
+    For backends that do not use Unix time, the first frame sets the offset.
     """
 
     def __init__(self, computer: Computer) -> None:
@@ -158,7 +153,7 @@ class _Stamps:
         self._first = True
 
     def of(self, stamp_s: float) -> float:
-        """Return when a frame came: neither before the start, nor in the future."""
+        """Return the time of a frame, which is not before the start nor in the future."""
         at_s = now_s(self._computer)
         if self._first and abs(stamp_s - self._offset_s - at_s) > 2 * REFRESH_S:
             self._offset_s = stamp_s - at_s
@@ -181,8 +176,8 @@ def _draw(path: Path, picture: str) -> None:
         converter = shutil.which("rsvg-convert")
         if converter is None:
             raise CanductorError(
-                f"'{path}': a PNG is made by rsvg-convert, which is missing: install librsvg2-bin, or give a"
-                " name that ends in .svg"
+                f"'{path}': a PNG needs rsvg-convert, which is missing; install librsvg2-bin, or give a name "
+                "that ends in .svg"
             )
         subprocess.run([converter, "-o", path], input=picture.encode(), capture_output=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
@@ -194,16 +189,12 @@ def _draw(path: Path, picture: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LoadReport:
-    """What was measured."""
+    """Result of a measurement."""
 
     load: BusLoad
     bus: str
     plot: str | None = None
-
-    @property
-    def ok(self) -> bool:
-        """A busy bus is no failure: ``doctor`` judges."""
-        return True
+    ok: bool = True
 
     def to_json(self) -> Mapping[str, object]:
         """Return all figures; shares are of 1."""
@@ -243,10 +234,10 @@ class LoadReport:
         """Return it as tables."""
         load = self.load
         if not load.frames and not load.error_reports:
-            return f"{self.bus}: not one frame in {load.duration_s:.1f} s"
+            return f"{self.bus}: no frame in {load.duration_s:.1f} s"
         lines = [
             f"{self.bus}: {load.mean:.1%} of {load.bitrate} bit/s in {load.duration_s:.1f} s",
-            f"busiest {load.window_s:g} s: {load.peak:.1%}, from {load.peak_at_s:g} s on",
+            f"busiest {load.window_s:g} s: {load.peak:.1%}, starting at {load.peak_at_s:g} s",
             f"{load.frames_per_s:,.0f} frames/s",
             _bar(load.mean, load.peak),
             "",
@@ -276,7 +267,7 @@ class LoadReport:
         lines: list[str] = []
         if self.load.error_reports:
             lines += paragraph(
-                f"{count(self.load.error_reports, 'error report')}: what an error costs is estimated"
+                f"{count(self.load.error_reports, 'error report')}: the cost of errors is estimated"
             )
         if self.load.unmeasured:
             lines += paragraph(f"{count(self.load.unmeasured, 'CAN FD frame')} counted, but not measured")
@@ -290,14 +281,14 @@ def _part(part: Any) -> dict[str, object]:
 
 
 def id_name(key: int) -> str:
-    """Return how an id of BusLoad.ids is shown."""
+    """Return an id of BusLoad.ids as text."""
     if key == OTHER_IDS:
         return "other"
     return f"{key & (EXTENDED - 1):08x}" if key & EXTENDED else f"{key:03x}"
 
 
 def what_is(key: int) -> str:
-    """Return whose id it is."""
+    """Return the purpose of an id."""
     if key == OTHER_IDS or key & EXTENDED:
         return TrafficClass.OTHER.value
     owner = owner_of(key)
@@ -315,7 +306,7 @@ def _bar(mean: float, peak: float, width: int = BAR) -> str:
 
 
 class _Screen:
-    """Shows reports as they change: in place on a terminal, one line each elsewhere."""
+    """Shows changing reports: in place on a terminal, else one line each."""
 
     def __init__(self) -> None:
         self._in_place = sys.stdout.isatty()

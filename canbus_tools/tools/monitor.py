@@ -1,28 +1,26 @@
-"""``canductor can monitor``: live traffic by names, as lines or on a screen, with figures of every node."""
+"""``canductor can monitor``: live decoded traffic, as lines or on a screen, with statistics of every node."""
 
 import argparse
-import json
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from canbus_tools.bus.bus_load import BITRATE_MAX, LoadMeter
+from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.bus.computer import Computer, Listener, now_s
-from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
+from canbus_tools.bus.open_bus import BITRATE_MAX, BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import BusTalk, refuse_if_in_use
 from canbus_tools.bus.until_stopped import StopFlag, stop_flag
 from canbus_tools.discovery.inventory import take_inventory
-from canbus_tools.monitor.bus_watch import BusWatch
-from canbus_tools.monitor.options import MonitorOptions
+from canbus_tools.monitor.bus_watch import BusWatch, MonitorOptions
 from canbus_tools.monitor.screen import MonitorScreen
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries
-from canbus_tools.protocol.filters import declare_filter, given_filter
+from canbus_tools.protocol.filters import declare_filter, given_filter, read_filter
 from canbus_tools.protocol.lines import line_of
-from canbus_tools.recordings.mcap_file import json_of
+from canbus_tools.recordings.mcap_file import json_line
 from canbus_tools.tools.load import find_bitrate
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
@@ -45,11 +43,11 @@ def declare(command: argparse.ArgumentParser) -> None:
         type=_fetched,
         metavar="NODE",
         action="append",
-        help="first download the dictionary of this node, or of 'all' that no host uses; sends frames",
+        help="first download the dictionary of this node, or of 'all' nodes that no host uses; sends frames",
     )
     declare_filter(command)
     add = command.add_argument
-    add("--lines", action="store_true", help="print lines; the default if the output is no terminal")
+    add("--lines", action="store_true", help="print lines; default if the output is not a terminal")
     add(
         "--duration",
         dest="duration_s",
@@ -69,14 +67,13 @@ def make_job(given: argparse.Namespace) -> "Callable[[Computer], MonitorReport]"
         bus=bus,
         bitrate=bitrate,
         bitrate_is_known=is_known,
-        filter_=given_filter(given),
-        filter_text=_filter_text(given),
+        filter_text=given_filter(given),
         fetch=tuple(given.fetch or ()),
         lines=given.lines or given.json or not sys.stdout.isatty(),
         as_json=given.json,
     )
     if not options.lines and not sys.stdin.isatty():
-        raise UsageError("the screen is operated by keys, but standard input is no terminal; give --lines")
+        raise UsageError("the screen needs a keyboard, but standard input is not a terminal; give --lines")
     return lambda computer: run_monitor(computer, options)
 
 
@@ -85,25 +82,22 @@ def _fetched(text: str) -> str:
 
 
 def run_monitor(computer: Computer, options: MonitorOptions) -> "MonitorReport":
-    """Show the bus until the user has seen enough; raises CanductorError."""
+    """Show the bus until the user ends it; raises CanductorError."""
     source = DictionarySource(options.dictionaries, DictionaryCache.of_user())
     if options.fetch:
         for nodeid, dictionary in computer.run(fetch(computer, options.bus, options.fetch)).items():
             source.put(nodeid, dictionary, FETCHED)
     watch = BusWatch(BusDecoder(source), LoadMeter(options.bitrate), now_s(computer))
     with computer.listen(options.bus) as queue:
-        run = _run_lines if options.lines else _run_screen
-        shown = run(computer, options, watch, queue)
+        if options.lines:
+            shown = Lines(computer, options, watch, queue).run()
+        else:
+            shown = _run_screen(MonitorScreen(computer, options, watch, queue))
         return MonitorReport(options, watch, shown, queue.dropped)
 
 
-def _run_lines(computer: Computer, options: MonitorOptions, watch: BusWatch, queue: Listener) -> int:
-    return Lines(computer, options, watch, queue).run()
-
-
-def _run_screen(computer: Computer, options: MonitorOptions, watch: BusWatch, queue: Listener) -> int:
+def _run_screen(screen: MonitorScreen) -> int:
     before = signal.getsignal(signal.SIGTERM)
-    screen = MonitorScreen(computer, options, watch, queue)
     screen.run()
     signal.signal(signal.SIGTERM, before)
     if screen.terminated:
@@ -114,7 +108,7 @@ def _run_screen(computer: Computer, options: MonitorOptions, watch: BusWatch, qu
 
 
 async def fetch(computer: Computer, options: BusOptions, nodes: tuple[str, ...]) -> dict[int, Dictionary]:
-    """Ask nodes for their dictionaries; raises CanductorError when one is in use, or does not answer."""
+    """Read the dictionaries of nodes; raises CanductorError if one is in use or does not answer."""
     found: dict[int, Dictionary] = {}
     async with BusTalk.open(computer, options) as bus:
         if EVERY_NODE in nodes:
@@ -123,7 +117,7 @@ async def fetch(computer: Computer, options: BusOptions, nodes: tuple[str, ...])
             for entry in entries:
                 if entry.facts is None and entry.nodeid is not None:
                     why = entry.trouble or "another host uses it"
-                    sys.stderr.write(f"canductor: node {entry.nodeid} was not asked: {why}\n")
+                    sys.stderr.write(f"canductor: node {entry.nodeid} was not queried: {why}\n")
         else:
             wanted = [int(node) for node in nodes]
             for nodeid in wanted:
@@ -135,7 +129,7 @@ async def fetch(computer: Computer, options: BusOptions, nodes: tuple[str, ...])
 
 
 class Lines:
-    """Writes what is said as lines, each at once."""
+    """Writes decoded traffic as lines, without delay."""
 
     def __init__(self, computer: Computer, options: MonitorOptions, watch: BusWatch, queue: Listener) -> None:
         self._computer = computer
@@ -143,13 +137,14 @@ class Lines:
         self._watch = watch
         self._queue = queue
         self._form = json_line if options.as_json else line_of
-        self._told_dropped = 0
-        self._told: set[str] = set()
+        self._passes = read_filter(options.filter_text).passes
+        self._reported_drops = 0
+        self._reported: set[str] = set()
 
     def run(self) -> int:
-        """Write until the duration is over, Ctrl-C or SIGTERM; returns how many lines.
+        """Write until the duration is over, Ctrl-C or SIGTERM; returns the number of lines.
 
-        They end it between two lines: what was written was counted.
+        Signals end it between two lines, so that every line written is counted.
         """
         shown = 0
         with stop_flag() as flag:
@@ -157,27 +152,26 @@ class Lines:
                 sys.stdout.write(self._form(said) + "\n")
                 sys.stdout.flush()
                 shown += 1
-                if self._queue.dropped > 2 * self._told_dropped:
-                    self._tell_dropped()
-        if self._queue.dropped > self._told_dropped:
-            self._tell_dropped()
+                if self._queue.dropped > 2 * self._reported_drops:
+                    self._report_drops()
+        if self._queue.dropped > self._reported_drops:
+            self._report_drops()
         return shown
 
-    def _tell_dropped(self) -> None:
-        self._told_dropped = self._queue.dropped
+    def _report_drops(self) -> None:
+        self._reported_drops = self._queue.dropped
         sys.stderr.write(
-            f"canductor: {self._told_dropped} frames were dropped until now: lines are read too slowly\n"
+            f"canductor: dropped {self._reported_drops} frames so far: lines are read too slowly\n"
         )
 
-    def _tell_guesses(self) -> None:
+    def _report_guesses(self) -> None:
         """Report each only once; there are at most 255 nodes, and 64 dictionaries in the cache."""
         guesses = {guess for node in self._watch.decoder.nodes.values() if (guess := node.guess)}
-        for guess in sorted(guesses - self._told):
+        for guess in sorted(guesses - self._reported):
             sys.stderr.write(f"canductor: {guess}\n")
-        self._told |= guesses
+        self._reported |= guesses
 
     def _said(self, flag: StopFlag) -> Iterator[Decoded]:
-        passes = self._options.filter_.passes
         duration_s = self._options.duration_s
         end_s = None if duration_s is None else now_s(self._computer) + duration_s
         while not flag.stopped and (end_s is None or now_s(self._computer) < end_s):
@@ -185,19 +179,14 @@ class Lines:
                 for said in self._watch.feed(frame):
                     if flag.stopped:
                         return
-                    if passes(said):
+                    if self._passes(said):
                         yield said
-            self._tell_guesses()
-
-
-def json_line(said: Decoded) -> str:
-    """Return one thing as a JSON object."""
-    return json.dumps({"time_s": said.time_s, **json_of(said)}, separators=(",", ":"))
+            self._report_guesses()
 
 
 @dataclass(frozen=True, slots=True)
 class MonitorReport:
-    """What was seen, in numbers."""
+    """Statistics of the traffic."""
 
     options: MonitorOptions
     watch: BusWatch
@@ -222,21 +211,13 @@ class MonitorReport:
         }
 
     def to_text(self) -> str:
-        """Return nothing: all has been shown."""
+        """Return nothing: everything was shown before."""
         return ""
 
 
-def _filter_text(given: argparse.Namespace) -> str:
-    """Return what ``declare_filter`` declared in the words that the screen's filter takes."""
-    words = [f"node={','.join(map(str, given.node))}"] if given.node else []
-    words += [f"kind={','.join(given.kind)}"] if given.kind else []
-    words += [f"dir={given.direction}"] if given.direction else []
-    return " ".join([*words, *(given.message or ())]) or "none"
-
-
 def _bitrate(bus: BusOptions) -> tuple[int, bool]:
-    """Return the bit rate to reckon with, and whether anybody said it."""
+    """Return the bit rate to calculate with, and whether it is known."""
     try:
         return find_bitrate(bus), True
     except CanductorError:
-        return BITRATE_MAX, False  # the usual one, and the screen says that it is assumed
+        return BITRATE_MAX, False  # the usual one; the screen shows "assumed"

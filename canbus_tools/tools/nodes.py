@@ -1,4 +1,4 @@
-"""``canductor can nodes``: every node that is alive, and what it is."""
+"""``canductor can nodes``: lists all nodes that answer, and their properties."""
 
 import argparse
 from collections.abc import Callable, Mapping
@@ -7,8 +7,8 @@ from typing import Final
 
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.bus.talk import LISTEN_S, BusTalk
-from canbus_tools.discovery.ask_bus import declare_listen, where
+from canbus_tools.bus.talk import on_bus
+from canbus_tools.discovery.ask_bus import declare_listen
 from canbus_tools.discovery.inventory import (
     PROBED,
     Inventory,
@@ -69,7 +69,12 @@ def declare(command: argparse.ArgumentParser) -> None:
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "NodesReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
-    return lambda computer: list_nodes(computer, bus, probed=given.probe, listen_s=given.listen)
+    return lambda computer: NodesReport(
+        bus,
+        on_bus(
+            computer, bus, lambda talk: take_full_inventory(talk, probed=given.probe, listen_s=given.listen)
+        ),
+    )
 
 
 def _ids(text: str) -> range:
@@ -83,21 +88,9 @@ def _ids(text: str) -> range:
     return range(low, high + 1)
 
 
-def list_nodes(
-    computer: Computer, options: BusOptions, *, probed: range = PROBED, listen_s: float = LISTEN_S
-) -> "NodesReport":
-    """Find all nodes and ask those to whom nobody talks who they are. Raises CanductorError."""
-
-    async def find() -> Inventory:
-        async with BusTalk.open(computer, options) as bus:
-            return await take_full_inventory(bus, options, probed=probed, listen_s=listen_s)
-
-    return NodesReport(options, computer.run(find()))
-
-
 @dataclass(frozen=True, slots=True)
 class NodesReport:
-    """Every node."""
+    """All nodes that were found."""
 
     bus: BusOptions
     found: Inventory
@@ -118,14 +111,14 @@ class NodesReport:
         entries = self.found.entries
         lines = [f"{count(self.found.boards, 'node')} on {self.bus.name}", ""]
         if not entries:
-            return "\n".join(lines + _nobody(self.bus, self.found))
+            return "\n".join(lines + _no_nodes(self.bus, self.found))
         lines += [*table(HEADINGS, [_row(entry) for entry in entries]), ""]
         notes = _notes(self.found, self.bus)
         return "\n".join(lines + [line for note in notes for line in paragraph(note)]).rstrip()
 
 
 def entry_json(entry: InventoryEntry) -> dict[str, object]:
-    """Return one node with all that it said."""
+    """Return one node with all that is known of it."""
     facts = entry.facts or entry.told or entry.passive
     return {
         "nodeid": entry.nodeid,
@@ -168,7 +161,7 @@ def _row(entry: InventoryEntry) -> list[str]:
 
 
 def duration(seconds: float | None) -> str:
-    """Return a time as people read it: 12 s, 3 min, 4.5 h, 6.2 d."""
+    """Return a time as text: 12 s, 3 min, 4.5 h, 6.2 d."""
     if seconds is None:
         return ""
     if seconds < 100:
@@ -184,29 +177,29 @@ def _notes(found: Inventory, bus: BusOptions) -> list[str]:
     if twins := sorted({str(entry.uuid) for entry in entries if entry.twins}):
         notes.append(
             f"Two boards have the uuid {', '.join(twins)} (cloned chips?): they cannot be used on one bus. "
-            "Take one of them off."
+            "Disconnect one of them."
         )
     for entry in entries:
         if entry.state is NodePresence.SHUTDOWN:
             notes.append(
-                f"Node {_name(entry)} has shut down and does nothing until its host restarts it; "
-                f"'canductor can release {entry.nodeid} {where(bus)}' resets it."
+                f"Node {_name(entry)} is shut down until its host restarts it; "
+                f"'canductor can release {entry.nodeid} {bus.arguments}' resets it."
             )
         if entry.state is NodePresence.BOOTLOADER:
-            notes.append(f"Node {_name(entry)} runs no firmware: flash it, or reset it.")
+            notes.append(f"Node {_name(entry)} runs its bootloader: flash it, or reset it.")
     if any(entry.state is NodePresence.IN_USE for entry in entries):
         notes.append(
-            "Nodes in use were not asked, so as not to disturb their host. The coordinator that drives them "
-            "reports what they are; of nodes of other hosts a uuid is known if their firmware is canductor's."
+            "Nodes in use were not queried, to avoid disturbing their host. A coordinator reports the nodes "
+            "that it drives; of other hosts' nodes the uuid is known if they run canductor's firmware."
         )
     if any(entry.passive for entry in entries):
         notes.append(
-            "What stands in a row with '?' was guessed: a dictionary in the cache explains what the node and "
-            "its host were heard to say."
+            "Rows with '?' were guessed: a dictionary in the cache explains the traffic of the node and its "
+            "host."
         )
     elif any(entry.state is NodePresence.IN_USE for entry in entries):
         notes.append(
-            "Their traffic reveals what they are if their dictionary is in the cache: run this once while "
+            "Their traffic identifies them if their dictionary is in the cache: run this command once while "
             "their host is stopped."
         )
     return notes
@@ -216,16 +209,17 @@ def _name(entry: InventoryEntry) -> str:
     return str(entry.uuid) if entry.nodeid is None else str(entry.nodeid)
 
 
-def _nobody(bus: BusOptions, found: Inventory) -> list[str]:
+def _no_nodes(bus: BusOptions, found: Inventory) -> list[str]:
     tried = f"ids {found.probed[0]} to {found.probed[-1]}" if found.probed else "no ids (--probe none)"
     lines = paragraph(
-        f"Nobody waits for an id, nobody says that it has one, no host was heard that talks to one, and of "
-        f"{tried} none answered."
+        "No node waits for an id, none reports that it has one, no host was heard that uses one, and none "
+        f"of {tried} answered."
     )
     if found.discovery.foreign_frames:
         lines += paragraph(
-            f"The bus works: {count(found.discovery.foreign_frames, 'frame')} of other protocols came by."
+            f"The bus works: {count(found.discovery.foreign_frames, 'frame')} of other protocols were seen."
         )
     return lines + paragraph(
-        f"'canductor can query {where(bus)}' says what to check; 'canductor can doctor {where(bus)}' checks."
+        f"'canductor can query {bus.arguments}' lists what to check; 'canductor can doctor {bus.arguments}' "
+        "checks the bus."
     )

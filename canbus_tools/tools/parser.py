@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Callable, Mapping
 from typing import Any, Final, Protocol
 
-from canbus_tools.bus.computer import Computer, ThisComputer
+from canbus_tools.bus.computer import Computer
 from canbus_tools.dissector import dissector
 from canbus_tools.tools import (
     assign_id,
@@ -63,6 +63,6 @@ def add_to(commands: Any) -> None:
 
 def _add(commands: Any, name: str, tool: Tool, summary: str) -> None:
     def run(given: argparse.Namespace) -> Any:
-        return tool.make_job(given)(getattr(given, "computer", None) or ThisComputer())
+        return tool.make_job(given)(getattr(given, "computer", None) or Computer())
 
     add_command(commands, name, summary, tool.declare, run)

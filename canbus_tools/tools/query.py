@@ -7,8 +7,8 @@ from typing import Final
 
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.bus.talk import BusTalk
-from canbus_tools.discovery.ask_bus import discover_nodes, where
+from canbus_tools.bus.talk import on_bus
+from canbus_tools.discovery.ask_bus import discover_nodes
 from canbus_tools.discovery.node_discovery import ROUNDS, Application, DiscoveredNodes, WaitingNode
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.option_values import integer
@@ -41,20 +41,15 @@ def make_job(given: argparse.Namespace) -> Callable[[Computer], "QueryReport"]:
 
 
 def query(computer: Computer, options: BusOptions, rounds: int = ROUNDS) -> "QueryReport":
-    """Ask who waits; changes nothing in any node. Raises CanductorError."""
+    """Find the nodes that wait for an id; changes nothing in any node. Raises CanductorError."""
     started_ns = computer.monotonic_ns()
-
-    async def ask() -> DiscoveredNodes:
-        async with BusTalk.open(computer, options) as bus:
-            return await discover_nodes(bus, rounds)
-
-    found = computer.run(ask())
+    found = on_bus(computer, options, lambda bus: discover_nodes(bus, rounds))
     return QueryReport(options, found, (computer.monotonic_ns() - started_ns) * 1e-9)
 
 
 @dataclass(frozen=True, slots=True)
 class QueryReport:
-    """Who waits."""
+    """The nodes that wait for an id."""
 
     bus: BusOptions
     found: DiscoveredNodes
@@ -100,14 +95,14 @@ class QueryReport:
             lines += ["", *table(("uuid", "application", "answers", ""), rows), ""]
             lines += _notes(found)
         else:
-            lines += ["", *_why_nobody(found, self.bus)]
+            lines += ["", *_why_none(found, self.bus)]
         return "\n".join(lines)
 
 
 def application_name(node: WaitingNode) -> str:
-    """Return what a waiting node is, for people."""
+    """Return the name of a waiting node's application."""
     if node.application is Application.UNKNOWN:
-        return f"unknown (takes its id by command 0x{node.set_command:02x})"
+        return f"unknown (its id is set by command 0x{node.set_command:02x})"
     return NAMES[node.application]
 
 
@@ -116,60 +111,53 @@ def assigned_ids(found: DiscoveredNodes) -> list[int]:
     return sorted({node.nodeid for node in found.here} | found.hosted | found.talking)
 
 
-def twin_note(found: DiscoveredNodes) -> str:
-    """Return what two boards with one uuid mean."""
-    uuids = ", ".join(str(uuid) for uuid in found.twins)
-    return (
-        f"Two boards have the uuid {uuids} (cloned chips, or one chip id copied): they would get the same id "
-        "and destroy each other's frames. Take one off the bus; it cannot be used together with the other."
-    )
-
-
 def _notes(found: DiscoveredNodes) -> list[str]:
     notes: list[str] = []
     if found.twins:
-        notes.append(twin_note(found))
+        uuids = ", ".join(str(uuid) for uuid in found.twins)
+        notes.append(
+            f"Two boards have the uuid {uuids} (cloned chips, or a copied chip id): they would get the same "
+            "id and destroy each other's frames. Disconnect one: they cannot be used on the same bus."
+        )
     kinds = {node.application for node in found.waiting}
     if Application.KLIPPER in kinds:
         notes.append(
-            "Klipper-type: Klipper's firmware or canductor's own. Without an id they answer alike; with one, "
-            "'canductor can nodes' tells them apart."
+            "Klipper-type: Klipper's firmware or canductor's own. Without an id both answer alike; with one, "
+            "'canductor can nodes' distinguishes them."
         )
     if Application.KATAPULT in kinds:
         notes.append(
             "Katapult: the board waits to be flashed, or its firmware did not start. Flash it, or reset it "
-            "to start the firmware that it has."
+            "to start its firmware."
         )
     notes.append("Nodes that have an id do not answer: 'canductor can nodes' lists those as well.")
     return [line for note in notes for line in paragraph(note)]
 
 
-def _why_nobody(found: DiscoveredNodes, bus: BusOptions) -> list[str]:
-    """Explain an empty answer: most often it is no fault at all."""
+def _why_none(found: DiscoveredNodes, bus: BusOptions) -> list[str]:
+    """Explain why no node answered, which is usually no fault."""
     ids = assigned_ids(found)
     lines = []
     if ids:
         lines.append(
             f"The bus works: {count(len(ids), 'node')} with an id {'was' if len(ids) == 1 else 'were'} heard "
-            f"({', '.join(map(str, ids))}), and only nodes without one answer this question."
+            f"({', '.join(map(str, ids))}), and only nodes without one answer this query."
         )
     else:
-        lines.append(
-            "Only nodes without an id answer this question. One that a host has given its id keeps it"
-        )
+        lines.append("Only nodes without an id answer this query. A node keeps the id that a host assigned")
         lines.append("until it is reset or switched off.")
-    lines.append(f"  'canductor can nodes {where(bus)}' lists nodes with an id too.")
-    lines.append(f"  'canductor can release NODEID {where(bus)}' makes one wait again.")
+    lines.append(f"  'canductor can nodes {bus.arguments}' lists nodes with an id too.")
+    lines.append(f"  'canductor can release NODEID {bus.arguments}' makes a node wait for an id again.")
     if not ids:
         lines += [
             "",
-            "Is no node there at all? Check, in this order:",
-            "  power      is the board's light on; USB alone does not always power its CAN side",
-            "  firmware   is it flashed, and built for CAN on the pins that its connector uses",
-            "  bit rate   host and all nodes need the same; a node at another one is never heard and may",
-            "             take the bus down. Firmware is built for one: 1000000, 500000 and 250000 are usual",
-            "  wiring     CANH to CANH, CANL to CANL, not crossed as a serial line is",
-            "  ends       a 120 ohm resistor at each end, none between: 60 ohm from CANH to CANL, power off",
-            f"  'canductor can doctor {where(bus)}' checks what can be checked from here.",
+            "If no node is found at all, check in this order:",
+            "  power        the board's LED is on; USB alone does not always power its CAN transceiver",
+            "  firmware     flashed, and built for CAN on the pins of the board's CAN connector",
+            "  bit rate     the same for host and all nodes; a node with another one is never heard and may",
+            "               disturb the bus. Firmware is built for one: usually 1000000, 500000 or 250000",
+            "  wiring       CANH to CANH, CANL to CANL, not crossed like a serial line",
+            "  termination  120 ohm at each end, none between: 60 ohm from CANH to CANL, power off",
+            f"  'canductor can doctor {bus.arguments}' checks what can be checked from here.",
         ]
     return lines

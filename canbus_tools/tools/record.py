@@ -1,12 +1,13 @@
-"""``canductor can record``: a live bus into a file, MCAP with all that was said or a plain candump log."""
+"""``canductor can record``: records a bus to a file: MCAP with decoded messages, or a candump log."""
 
 import argparse
 import contextlib
 import errno
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Final, Protocol
+from typing import BinaryIO, Final
 
 from canbus_tools.bus.computer import Computer, Listener, now_s
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
@@ -22,33 +23,23 @@ from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, decimal, parse_path
 
 LOOK_S: Final = 0.1
-"""How soon Ctrl-C and the end of the time are noticed on a silent bus."""
+"""Interval of checks for Ctrl-C and the end of the time on a silent bus."""
 DRAIN_S: Final = 1.0
-"""At the end, frames that had arrived are still recorded: so long at most, on a bus that is never quiet."""
+"""Longest time at the end for recording frames that have arrived already."""
 QUIET_S: Final = 0.02
 COUNTERS_S: Final = 1.0
-"""Between two entries of the counters, in the time of the frames."""
+"""Interval of the counters' entries, in the time of the frames."""
 DURATION_MAX_S: Final = 1e7
 
 
-class FrameFile(Protocol):
-    """Where frames are recorded to."""
-
-    def frame(self, frame: Frame) -> None:
-        """Add a frame; raises OSError."""
-
-    def finish(self) -> None:
-        """Bring it to its end; the file remains open."""
-
-
 def declare(command: argparse.ArgumentParser) -> None:
-    """Add the options of the tool."""
+    """Add the options."""
     declare_bus(command)
     add = command.add_argument
     add(
         "-o",
         "--output",
-        type=_output,
+        type=lambda text: parse_path(text, ".mcap", ".log"),
         metavar="FILE",
         required=True,
         help="file to write: FILE.mcap, or FILE.log for a candump log",
@@ -64,16 +55,12 @@ def declare(command: argparse.ArgumentParser) -> None:
 
 
 def make_job(given: argparse.Namespace) -> "Callable[[Computer], RecordReport]":
-    """Check what was given and return the job."""
+    """Return the job; raises UsageError."""
     path: Path = given.output
     if path.exists() and not given.force:
-        raise UsageError(f"'{path}' exists already; --force overwrites it")
+        raise UsageError(f"'{path}' exists already; give --force to overwrite it")
     options = bus_options(given)
     return lambda computer: record_bus(computer, options, path, given.duration, given.dictionaries)
-
-
-def _output(text: str) -> Path:
-    return parse_path(text, ".mcap", ".log")
 
 
 def record_bus(
@@ -90,14 +77,16 @@ def record_bus(
         computer.listen(options) as bus,
         _writing(path, report) as file,
     ):
-        recorder = _recorder(path, file, dictionaries or {})
+        decoder = BusDecoder(DictionarySource(dictionaries, DictionaryCache.of_user()))
+        log = path.suffix.lower() == ".log"
+        recorder = CandumpFile(file) if log else McapFile(file, decoder)
         sys.stderr.write(f"recording {options.name} to '{path}'; Ctrl-C ends it\n")
         sys.stderr.flush()
         try:
             for frame in _until_end(computer, bus, flag, duration_s):
                 recorder.frame(frame)
                 report.frames += 1
-        finally:  # whatever ends it, the file is complete up to there
+        finally:  # whatever ends the recording, the file is valid
             recorder.finish()
             report.dropped = bus.dropped
     return report
@@ -106,7 +95,7 @@ def record_bus(
 def _until_end(
     computer: Computer, bus: Listener, flag: StopFlag, duration_s: float | None
 ) -> Iterator[Frame]:
-    """Yield frames until the time is over or the user stops it, and then those that are on their way."""
+    """Yield frames until the time is over or the user stops it, then those that have arrived already."""
     end_s = None if duration_s is None else now_s(computer) + duration_s
     while not flag.stopped:
         left_s = LOOK_S if end_s is None else min(LOOK_S, end_s - now_s(computer))
@@ -118,23 +107,15 @@ def _until_end(
 
 @contextlib.contextmanager
 def _writing(path: Path, report: "RecordReport") -> Iterator[BinaryIO]:
-    """Open the file; a disk that fails ends in one sentence."""
+    """Open the file; raises CanductorError when writing fails."""
     try:
         with path.open("wb") as file:
             yield file
         report.size_bytes = path.stat().st_size
     except OSError as error:
         why = error.strerror or str(error)
-        todo = "; make room, or record elsewhere" if error.errno == errno.ENOSPC else ""
-        raise CanductorError(
-            f"'{path}' cannot be written: {why}, after {report.frames} frames{todo}"
-        ) from None
-
-
-def _recorder(path: Path, file: BinaryIO, dictionaries: Mapping[int, Dictionary]) -> FrameFile:
-    if path.suffix.lower() == ".log":
-        return CandumpFile(file)
-    return McapFile(file, BusDecoder(DictionarySource(dictionaries, DictionaryCache.of_user())))
+        todo = "; free some space, or record elsewhere" if error.errno == errno.ENOSPC else ""
+        raise CanductorError(f"writing '{path}' failed after {report.frames} frames: {why}{todo}") from None
 
 
 class CandumpFile:
@@ -148,12 +129,12 @@ class CandumpFile:
         self._file.write(candump_line(frame).encode())
 
     def finish(self) -> None:
-        """Write what is held back."""
+        """Write buffered lines."""
         self._file.flush()
 
 
 class McapFile:
-    """Frames, what they say by DECODER, and its counters."""
+    """An MCAP file with frames, messages decoded by DECODER, and its counters."""
 
     def __init__(self, file: BinaryIO, decoder: BusDecoder) -> None:
         self._writer = McapWriter(file)
@@ -163,7 +144,7 @@ class McapFile:
         self._counted_s: float | None = None
 
     def frame(self, frame: Frame) -> None:
-        """Add a frame and what it completes."""
+        """Add a frame and the messages that it completes."""
         self._writer.frame(frame)
         self._frames += 1
         self._bytes += len(frame.data)
@@ -176,7 +157,7 @@ class McapFile:
             self._count()
 
     def finish(self) -> None:
-        """Add what can still be read, the last counters and the index."""
+        """Add the last messages, the last counters and the index."""
         for said in self._decoder.flush():
             self._writer.said(said)
         self._count()
@@ -188,21 +169,20 @@ class McapFile:
         self._writer.counters(self._last_s, {"frames": self._frames, "bytes": self._bytes, "nodes": nodes})
 
 
+@dataclass(slots=True)
 class RecordReport:
-    """What was recorded."""
+    """Figures of a recording."""
 
-    ok = True
-
-    def __init__(self, path: Path, bus: str) -> None:
-        self.path = path
-        self.bus = bus
-        self.frames = 0
-        self.size_bytes = 0
-        self.dropped = 0
-        """Frames that came faster than they could be recorded."""
+    path: Path
+    bus: str
+    frames: int = 0
+    size_bytes: int = 0
+    dropped: int = 0
+    """Frames that arrived faster than they could be recorded."""
+    ok: bool = True
 
     def to_json(self) -> Mapping[str, object]:
-        """Return file, frames and bytes."""
+        """Return the figures."""
         return {
             "bus": self.bus,
             "file": str(self.path),
@@ -212,8 +192,8 @@ class RecordReport:
         }
 
     def to_text(self) -> str:
-        """Return it as a sentence."""
-        dropped = f"; {self.dropped} more came too fast and were dropped" if self.dropped else ""
+        """Return the figures as a sentence."""
+        dropped = f"; {self.dropped} further frames arrived too fast and were dropped" if self.dropped else ""
         return (
             f"{self.frames} frames of {self.bus} recorded to '{self.path}' ({self.size_bytes} bytes){dropped}"
         )

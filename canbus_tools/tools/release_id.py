@@ -9,10 +9,10 @@ from typing import Final
 
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError, in_use, refuse_if_in_use
-from canbus_tools.discovery.ask_bus import declare_listen, discover_nodes, where
+from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError, in_use, on_bus, refuse_if_in_use
+from canbus_tools.discovery.ask_bus import declare_listen, discover_nodes
 from canbus_tools.discovery.inventory import NodePresence, take_inventory
-from canbus_tools.discovery.node_discovery import Application, DiscoveredNodes, WaitingNode
+from canbus_tools.discovery.node_discovery import DiscoveredNodes, WaitingNode
 from canbus_tools.tools.assign_id import parse_uuid
 from canbus_tools.tools.query import application_name
 from nodes.bus.assign import AssignError, Uuid
@@ -22,9 +22,9 @@ from nodes.support.option_values import parse_int
 
 RESET: Final = "reset"
 LEAVE_S: Final = 0.3
-"""A node resets when it has acknowledged the command, or without doing so."""
+"""Time for the acknowledgement of the reset command, which a node may omit."""
 RETURN_S: Final = 6.0
-"""How long a board may take to start, through its bootloader."""
+"""Longest time that a board takes to start, through its bootloader."""
 
 
 def declare(command: argparse.ArgumentParser) -> None:
@@ -35,105 +35,75 @@ def declare(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--force",
         action="store_true",
-        help="release the node even if another program uses it; that program loses it",
+        help="release the node even if another program uses it; that program loses the node",
     )
 
 
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "ReleaseReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
-    return lambda computer: release(computer, bus, given.node, force=given.force, listen_s=given.listen)
+    return lambda computer: on_bus(
+        computer, bus, lambda talk: release(talk, given.node, force=given.force, listen_s=given.listen)
+    )
 
 
 def _node(given: str) -> Uuid | int:
     text = given.strip()
-    # A uuid has 12 digits, an id at most 3; what is neither is most likely a uuid with a digit amiss.
+    # A uuid has 12 digits, an id at most 3; anything else is probably a mistyped uuid.
     if text.isascii() and text.isdecimal() and len(text) < 2 * UUID_SIZE:
         return parse_int(text, 1, LAST_NODEID)
     return parse_uuid(text)
 
 
-def release(
-    computer: Computer,
-    options: BusOptions,
-    node: Uuid | int,
-    *,
-    force: bool = False,
-    listen_s: float = LISTEN_S,
-) -> "ReleaseReport":
-    """Reset NODE and wait until it asks for an id again; raises CanductorError with what to do."""
-
-    async def run() -> ReleaseReport:
-        async with BusTalk.open(computer, options) as bus:
-            return await release_on(bus, node, force=force, listen_s=listen_s)
-
-    return computer.run(run())
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class ReleaseReport:
-    """The node waits."""
+    """A node that waits for an id."""
 
     bus: BusOptions
-    uuid: Uuid
-    application: Application
-    text: str
-    nodeid: int | None
-    """The id it had; None: it had none."""
+    node: WaitingNode
+    nodeid: int | None = None
+    """The id that it had, if any."""
     ok: bool = True
 
     def to_json(self) -> Mapping[str, object]:
         """Return all of it."""
         return {
             "bus": self.bus.name,
-            "uuid": str(self.uuid),
+            "uuid": str(self.node.uuid),
             "nodeid": self.nodeid,
-            "application": self.application.value,
+            "application": self.node.application.value,
             "waited_before": self.nodeid is None,
         }
 
     def to_text(self) -> str:
         """Return one line."""
-        return self.text
+        waits = "waits for an id already" if self.nodeid is None else "was reset and waits for an id now"
+        had = "" if self.nodeid is None else f"had id {self.nodeid}, "
+        return f"{self.node.uuid} {had}{waits} ({application_name(self.node)})"
 
 
-async def release_on(
+async def release(
     bus: BusTalk, node: Uuid | int, *, force: bool = False, listen_s: float = LISTEN_S
 ) -> ReleaseReport:
-    """Reset NODE on an open bus, as ``release`` does."""
+    """Reset NODE and wait until it waits for an id again; raises CanductorError with what to do."""
     before = await discover_nodes(bus)
     if isinstance(node, int):
         nodeid = node
         if not force:
             await refuse_if_in_use(bus, nodeid, listen_s)
     else:
-        waits = _waiting(before, node)
+        waits = next((waiting for waiting in before.waiting if waiting.uuid == node), None)
         if waits is not None and node not in before.twins:
-            return _report(bus, waits, None)
+            return ReleaseReport(bus.options, waits)
         nodeid = await _find(bus, node, before, force=force, listen_s=listen_s)
     uuid = await _reset(bus, nodeid)
     expected = uuid or (node if isinstance(node, Uuid) else None)
     returned = await _returned(bus, nodeid, expected, before)
-    return _report(bus, returned, nodeid)
-
-
-def _report(bus: BusTalk, node: WaitingNode, nodeid: int | None) -> ReleaseReport:
-    what = application_name(node)
-    if nodeid is None:
-        text = f"{node.uuid} waits for an id already ({what})"
-    else:
-        text = f"{node.uuid} had id {nodeid}, was reset and waits for an id now ({what})"
-    return ReleaseReport(
-        bus=bus.options, uuid=node.uuid, application=node.application, text=text, nodeid=nodeid
-    )
-
-
-def _waiting(discovery: DiscoveredNodes, uuid: Uuid) -> WaitingNode | None:
-    return next((node for node in discovery.waiting if node.uuid == uuid), None)
+    return ReleaseReport(bus.options, returned, nodeid)
 
 
 async def _find(bus: BusTalk, uuid: Uuid, discovery: DiscoveredNodes, *, force: bool, listen_s: float) -> int:
-    """Return the id that UUID has, and that nobody else uses; raises CanductorError."""
+    """Return the id of the node UUID, which no other program uses; raises CanductorError."""
     ours = {node.nodeid for node in discovery.here if node.uuid == uuid}
     if force and len(ours) == 1:
         return ours.pop()
@@ -144,14 +114,13 @@ async def _find(bus: BusTalk, uuid: Uuid, discovery: DiscoveredNodes, *, force: 
     ]
     if len(found) > 1 or any(entry.twins for entry in found):
         raise AssignError(
-            f"two boards on {bus.name} have the uuid {uuid} (cloned chips?); take one of them off, or name "
+            f"two boards on {bus.name} have the uuid {uuid} (cloned chips?); disconnect one of them, or name "
             "one by its id"
         )
     if not found or found[0].nodeid is None:
         raise AssignError(
-            f"no node on {bus.name} that can be asked has the uuid {uuid}; "
-            f"'canductor can nodes {where(bus.options)}' lists them, and a node that another program talks "
-            "to can be named by its id"
+            f"no node with the uuid {uuid} was found on {bus.name}; 'canductor can nodes "
+            f"{bus.options.arguments}' lists all nodes; name a node that another program uses by its id"
         )
     if found[0].state is NodePresence.IN_USE:
         raise TalkError(in_use(bus.name, found[0].nodeid))
@@ -163,21 +132,21 @@ async def _reset(bus: BusTalk, nodeid: int) -> Uuid | None:
     async with bus.node(nodeid) as talk:
         if RESET not in talk.dictionary.commands or talk.dictionary.commands[RESET].names:
             raise AssignError(
-                f"the firmware of node {nodeid} on {bus.name} ({talk.dictionary.version}) has no command to "
-                "reset it; switch it off and on"
+                f"the firmware of node {nodeid} on {bus.name} ({talk.dictionary.version}) has no reset "
+                "command; switch the node off and on"
             )
         uuid: Uuid | None = None
         if talk.knows("get_canbus_id", "canbus_id"):
             answer = (await talk.ask("get_canbus_id", "canbus_id")).message.params.get("canbus_uuid")
             uuid = Uuid(answer) if isinstance(answer, bytes) and len(answer) == UUID_SIZE else None
-        talk.send_text(RESET)
+        talk.send(RESET)
         with contextlib.suppress(TimeoutError, CanductorError):  # it may reset without an acknowledgement
             await asyncio.wait_for(talk.drained(), LEAVE_S)
         return uuid
 
 
 async def _returned(bus: BusTalk, nodeid: int, uuid: Uuid | None, before: DiscoveredNodes) -> WaitingNode:
-    """Wait until the node asks for an id; one whose uuid is not known is whoever did not wait before."""
+    """Wait until the node waits for an id; without a UUID, it is the one that did not wait BEFORE."""
     known = {node.uuid for node in before.waiting}
     loop = asyncio.get_running_loop()
     deadline_s = loop.time() + RETURN_S
@@ -187,6 +156,6 @@ async def _returned(bus: BusTalk, nodeid: int, uuid: Uuid | None, before: Discov
             if node.uuid == uuid or (uuid is None and node.uuid not in known):
                 return node
     raise AssignError(
-        f"node {uuid or nodeid} on {bus.name} was reset and does not wait for an id after "
-        f"{RETURN_S:g} s; another host may have given it one again, else switch it off and on"
+        f"node {uuid or nodeid} on {bus.name} was reset, but does not wait for an id after {RETURN_S:g} s; "
+        "check whether another host assigned one again, else switch it off and on"
     )

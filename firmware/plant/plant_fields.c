@@ -59,39 +59,36 @@ static int read_word(int *out, const char *text, const char *const *words, int c
     return -1;
 }
 
-static int find_axis(const struct plant *plant, const char *name) {
-    for (int i = 0; i < plant->axis_count; i++)
-        if (strcmp(plant->axes[i].name, name) == 0)
+// The number of the item NAME of COUNT ITEMS of SIZE bytes, which begin with their names; -1: none.
+static int find(const void *items, int count, size_t size, const char *name) {
+    for (int i = 0; i < count; i++)
+        if (strcmp((const char *)items + (size_t)i * size, name) == 0)
             return i;
     return -1;
+}
+
+static int find_axis(const struct plant *plant, const char *name) {
+    return find(plant->axes, plant->axis_count, sizeof(*plant->axes), name);
 }
 
 int plant_text_body(const struct plant *plant, const char *name) {
-    for (int i = 0; i < plant->body_count; i++)
-        if (strcmp(plant->bodies[i].name, name) == 0)
-            return i;
-    return -1;
+    return find(plant->bodies, plant->body_count, sizeof(*plant->bodies), name);
 }
 
 int plant_text_stepper(const struct plant *plant, const char *name) {
-    for (int i = 0; i < plant->stepper_count; i++)
-        if (strcmp(plant->steppers[i].name, name) == 0)
-            return i;
-    return -1;
+    return find(plant->steppers, plant->stepper_count, sizeof(*plant->steppers), name);
 }
 
 int plant_text_fan(const struct plant *plant, const char *name) {
-    for (int i = 0; i < plant->fan_count; i++)
-        if (strcmp(plant->fans[i].name, name) == 0)
-            return i;
-    return -1;
+    return find(plant->fans, plant->fan_count, sizeof(*plant->fans), name);
+}
+
+int plant_text_sensor(const struct plant *plant, const char *name) {
+    return find(plant->sensors, plant->sensor_count, sizeof(*plant->sensors), name);
 }
 
 int plant_text_tmc(const struct plant *plant, const char *name) {
-    for (int i = 0; i < plant->tmc_count; i++)
-        if (strcmp(plant->tmcs[i].name, name) == 0)
-            return i;
-    return -1;
+    return find(plant->tmcs, plant->tmc_count, sizeof(*plant->tmcs), name);
 }
 
 static int read_value(const struct plant *plant, const struct plant_field *field, void *target,

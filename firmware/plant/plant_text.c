@@ -288,13 +288,6 @@ static int read_sensor(const struct plant_reader *reader, char *rest) {
            resolve(reader, &sensor->body, plant_text_body) || check_curve(reader, sensor);
 }
 
-static int find_sensor(const struct plant *plant, const char *name) {
-    for (int i = 0; i < plant->sensor_count; i++)
-        if (strcmp(plant->sensors[i].name, name) == 0)
-            return i;
-    return -1;
-}
-
 static int read_point(const struct plant_reader *reader, char *rest) {
     struct line {
         char sensor[PLANT_NAME];
@@ -307,7 +300,7 @@ static int read_point(const struct plant_reader *reader, char *rest) {
     };
     if (plant_text_fields(reader, FIELDS(fields), rest, &line))
         return -1;
-    int found = find_sensor(reader->plant, line.sensor);
+    int found = plant_text_sensor(reader->plant, line.sensor);
     if (found < 0)
         return plant_text_fail(reader, line.sensor, "is not described above");
     struct plant_sensor *sensor = &reader->plant->sensors[found];

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Between the two files that read the description of a plant.
+// Interface between the two files that read the description of a plant.
 #ifndef BOARDS_PLANT_TEXT_H
 #define BOARDS_PLANT_TEXT_H
 
@@ -12,7 +12,7 @@ struct plant_field {
     enum plant_type type;
     size_t offset;
     double min, max;  // of a number
-    uint8_t may_lack; // the value stands there already
+    uint8_t may_lack; // optional; the default is already set
 };
 
 struct plant_reader {
@@ -21,15 +21,16 @@ struct plant_reader {
     int line;
 };
 
-// Says what is wrong with TEXT in this line; returns -1.
+// Writes the error WHAT about TEXT in this line; returns -1.
 int plant_text_fail(const struct plant_reader *reader, const char *text, const char *what);
-// Reads the words of REST, name=value, into TARGET; -1 after it has said what is wrong.
+// Reads the words of REST, name=value, into TARGET; returns -1 after writing an error.
 int plant_text_fields(const struct plant_reader *reader, const struct plant_field *fields, size_t count,
                       char *rest, void *target);
-// The numbers of what has been described so far; -1: nothing of that name.
+// The numbers of the items described so far; -1: no item of that name.
 int plant_text_stepper(const struct plant *plant, const char *name);
 int plant_text_body(const struct plant *plant, const char *name);
 int plant_text_tmc(const struct plant *plant, const char *name);
 int plant_text_fan(const struct plant *plant, const char *name);
+int plant_text_sensor(const struct plant *plant, const char *name);
 
 #endif

@@ -2,11 +2,11 @@
 
 import pytest
 
-from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError
+from canbus_tools.bus.talk import BusTalk, TalkError, on_bus
 from canbus_tools.discovery.ask_bus import discover_nodes
-from canbus_tools.discovery.inventory import DAMAGED_BLOCK, PROBED, NodePresence, take_full_inventory
-from canbus_tools.tools.nodes import NodesReport, list_nodes
-from canbus_tools.tools.release_id import release_on
+from canbus_tools.discovery.inventory import DAMAGED_BLOCK, NodePresence, take_full_inventory
+from canbus_tools.tools.nodes import NodesReport
+from canbus_tools.tools.release_id import release
 from nodes.bus.assign import AssignError
 from nodes.bus.can_bus import CanBus
 from nodes.node.states import NodeState
@@ -21,9 +21,9 @@ def test_all_tools_that_ask_leave_a_host_its_nodes(six: SixNodes) -> None:
         async with BusTalk.open(stage.computer, options) as bus:
             discovery = await discover_nodes(bus)
             assert BED in {waiting.uuid for waiting in discovery.waiting}
-            found = await take_full_inventory(bus, options, probed=PROBED, listen_s=LISTEN_S)
+            found = await take_full_inventory(bus)
             states = {entry.nodeid: entry.state for entry in found.entries if entry.nodeid}
-            [main] = found.by_nodeid(MAIN_ID)
+            [main] = [entry for entry in found.entries if entry.nodeid == MAIN_ID]
             assert main.facts is None
             assert main.passive is not None
             assert main.passive.firmware.mcu == "virtual-mainboard"
@@ -32,7 +32,7 @@ def test_all_tools_that_ask_leave_a_host_its_nodes(six: SixNodes) -> None:
             assert MAIN_ID not in found.probed
             for words in (MAIN, MAIN_ID):
                 with pytest.raises((TalkError, AssignError), match="in use"):
-                    await release_on(bus, words)
+                    await release(bus, words)
 
     async def drive() -> None:
         port = stage.computer.open_can(options)
@@ -52,7 +52,9 @@ def test_all_tools_that_ask_leave_a_host_its_nodes(six: SixNodes) -> None:
             await bus.close()
             port.close()
 
-    list_nodes(stage.computer, options)  # now the cache has the dictionaries by which traffic is explained
+    on_bus(
+        stage.computer, options, take_full_inventory
+    )  # now the cache has the dictionaries by which traffic is explained
     with stage.user() as witness:
         stage.computer.run(drive())
     assert DAMAGED_BLOCK in witness.sent_to(TOOL_ID)

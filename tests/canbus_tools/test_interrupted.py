@@ -37,7 +37,7 @@ def test_a_controller_that_goes_off_the_bus_ends_the_question(stage: CanStage) -
             stage.world.at(at_ns, lambda: bus._frame_came(Frame(BUS_OFF, bytes(8), 0)))
             await discover_nodes(bus)
 
-    with pytest.raises(CanductorError, match=r"went off the bus \(bus-off\).*bit rate.*canductor can doctor"):
+    with pytest.raises(CanductorError, match=r"left the bus \(bus-off\).*bit rate.*canductor can doctor"):
         stage.computer.run(ask())
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import can
 import pytest
 
-from canbus_tools.bus.computer import FrameLine, ThisComputer
+from canbus_tools.bus.computer import Computer, FrameLine
 from canbus_tools.bus.open_bus import BusOptions
 from nodes.link import Frame
 from nodes.support.errors import CanductorError
@@ -41,7 +41,7 @@ def test_a_node_on_a_serial_line_is_asked(tmp_path: Path, capsys: pytest.Capture
 
 def test_any_backend_of_python_can_serves() -> None:
     options = BusOptions(interface="virtual", channel="this computer")
-    computer = ThisComputer()
+    computer = Computer()
     came: list[int] = []
     with can.Bus(interface="virtual", channel=options.channel) as other:
         bus: FrameLine
@@ -74,6 +74,6 @@ def test_any_backend_of_python_can_serves() -> None:
 @pytest.mark.parametrize("interface", ["canductor", "no such backend"])
 def test_a_bus_that_is_not_there_is_one_sentence(interface: str, tmp_path: Path) -> None:
     options = BusOptions(interface=interface, channel=str(tmp_path / "none"))
-    for open_it in (ThisComputer().open_can, ThisComputer().open_frames, ThisComputer().listen):
+    for open_it in (Computer().open_can, Computer().open_frames, Computer().listen):
         with pytest.raises(CanductorError, match="none"):
             open_it(options)

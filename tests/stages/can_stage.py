@@ -2,14 +2,14 @@
 
 import signal
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, closing, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Final
 
 from canbus_tools.bus.open_bus import BusOptions
-from canbus_tools.bus.talk import BusTalk, NodeTalk
+from canbus_tools.bus.talk import BusTalk, NodeTalk, refuse_if_in_use
 from canbus_tools.protocol.frame import Frame
 from coordinator.simulate.script import ScriptedWorld
 from nodes.bus.assign import Uuid
@@ -177,11 +177,20 @@ class CanStage:
         finally:
             sender.power_off()
 
+    @asynccontextmanager
+    async def talk(self, nodeid: int, *, force: bool = False) -> AsyncIterator[NodeTalk]:
+        """Open the bus and connect to a node, as the tools do; FORCE: although another host may use it."""
+        async with BusTalk.open(self.computer, self.options) as bus:
+            if not force:
+                await refuse_if_in_use(bus, nodeid)
+            async with bus.node(nodeid) as node:
+                yield node
+
     def ask(self, nodeid: int, question: str, answer: str, *, force: bool = False) -> Message:
         """Ask a node by the tools' own way."""
 
         async def talk() -> Message:
-            async with NodeTalk.open(self.computer, self.options, nodeid, force=force) as node:
+            async with self.talk(nodeid, force=force) as node:
                 return (await node.ask(question, answer)).message
 
         return self.computer.run(talk())

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
-from canbus_tools.bus.computer import Port
+from canbus_tools.bus.computer import Computer, Port
 from canbus_tools.bus.frame_queue import FRAMES_MAX
 from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.protocol.frame import Frame, FrameKind
@@ -28,7 +28,7 @@ _ID_MAX: Final = 0x7FF
 _ERROR_FLAG: Final = 0x2000_0000
 
 
-class SimulatedComputer:
+class SimulatedComputer(Computer):
     """A computer attached to WIRES and UARTS of WORLD; its adapters lose LOSS of what they receive.
 
     Adapters come from a pool: what is open at the same time has an adapter each.

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from canbus_tools.bus.computer import ThisComputer
+from canbus_tools.bus.computer import Computer
 from canbus_tools.tables.table_device import carry_out
 from coordinator.assembly.load import load_machine
 from coordinator.cli.arguments.target import declare_target, target_of
@@ -164,7 +164,7 @@ def _remove(given: argparse.Namespace) -> Report:
 def _on_device(given: argparse.Namespace, table: AxisTable | None, *, sends: bool) -> Report:
     if given.address is not None:
         raise UsageError("--at selects a running machine, --device drives without one; give one of them")
-    computer = getattr(given, "computer", None) or ThisComputer()
+    computer = getattr(given, "computer", None) or Computer()
     return carry_out(computer, device_job(given, table, sends=sends))
 
 

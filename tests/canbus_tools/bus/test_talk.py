@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from canbus_tools.bus.talk import LISTEN_S, BusTalk, NodeTalk, TalkError
+from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError
 from canbus_tools.protocol.frame import Frame
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.message_format import Message
@@ -26,7 +26,7 @@ def test_a_node_is_asked_and_told_things_and_everything_it_says_is_seen(six: Six
     stage = six.stage
 
     async def talk() -> None:
-        async with NodeTalk.open(stage.computer, stage.options, MAIN_ID) as node:
+        async with stage.talk(MAIN_ID) as node:
             assert node.dictionary.str_constant("MCU") == "virtual-mainboard"
             before = node.stats
             answer = await node.ask("get_canbus_id", "canbus_id")
@@ -42,7 +42,7 @@ def test_a_node_is_asked_and_told_things_and_everything_it_says_is_seen(six: Six
                     came.set()
 
             end = node.on_message(note)
-            node.send_text('debug_ping data="hello"')
+            node.send("debug_ping", data=b"hello")
             await came.wait()
             assert [message.data("data") for message in seen] == [b"hello"]
             end()

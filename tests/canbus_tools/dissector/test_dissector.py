@@ -275,9 +275,9 @@ class SmallHost:
 
     def block(self, *commands: str) -> bytes:
         content = b"".join(self._dictionary.encode_text(command) for command in commands)
-        head = bytes([len(content) + 5, BLOCK.sequence_mark | self._seq]) + content
+        head = bytes([len(content) + 5, BLOCK["sequence_mark"] | self._seq]) + content
         crc: int = lib.wire_crc16(head, len(head))
-        return head + crc.to_bytes(2) + bytes([BLOCK.sync])
+        return head + crc.to_bytes(2) + bytes([BLOCK["sync"]])
 
     def say(self, block: bytes) -> None:
         for at in range(0, len(block), 8):
@@ -287,9 +287,9 @@ class SmallHost:
         """Send one block and wait for the empty block that acknowledges it."""
         self.say(self.block(*commands))
         self._seq = (self._seq + 1) % 16
-        ack = bytes([5, BLOCK.sequence_mark | self._seq])
+        ack = bytes([5, BLOCK["sequence_mark"] | self._seq])
         crc: int = lib.wire_crc16(ack, len(ack))
-        self.wait_for_bytes(ack + crc.to_bytes(2) + bytes([BLOCK.sync]))
+        self.wait_for_bytes(ack + crc.to_bytes(2) + bytes([BLOCK["sync"]]))
 
     def wait_for_bytes(self, wanted: bytes) -> None:
         """Until the node's stream has WANTED, wherever its frames cut it."""

@@ -9,12 +9,10 @@ from textual.widgets import DataTable, Input, RichLog, Static
 
 from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.bus.computer import now_s
-from canbus_tools.monitor.bus_watch import BusWatch
-from canbus_tools.monitor.options import MonitorOptions
+from canbus_tools.monitor.bus_watch import BusWatch, MonitorOptions
 from canbus_tools.monitor.screen import KEPT, LINES_AT_ONCE, LOG_LINES, MonitorScreen
-from canbus_tools.monitor.text import read_filter
 from canbus_tools.protocol.decoder import BusDecoder
-from canbus_tools.protocol.filters import Filter
+from canbus_tools.protocol.filters import read_filter
 from canbus_tools.protocol.frame import Frame
 from nodes.support.option_values import UsageError
 from tests.stages.can_stage import MAIN, MAIN_ID, CanStage, conversation_parts
@@ -75,9 +73,7 @@ def on_screen(stage: CanStage, size: tuple[int, int], test: Callable[[Stand], Aw
     """Run TEST with the screen; the bus's time goes on when the test says so."""
 
     async def run() -> None:
-        options = MonitorOptions(
-            bus=stage.options, bitrate=1_000_000, bitrate_is_known=True, filter_=Filter(), dictionaries={}
-        )
+        options = MonitorOptions(bus=stage.options, bitrate=1_000_000, bitrate_is_known=True, dictionaries={})
         with stage.computer.listen(stage.options) as listener:
             watch = BusWatch(BusDecoder(), LoadMeter(1_000_000), now_s(stage.computer))
             screen = MonitorScreen(stage.computer, options, watch, listener)
@@ -90,7 +86,7 @@ def on_screen(stage: CanStage, size: tuple[int, int], test: Callable[[Stand], Aw
 
 def test_traffic_is_shown_by_names(stage: CanStage) -> None:
     async def test(stand: Stand) -> None:
-        assert "nothing heard yet" in stand.text("#state")
+        assert "no frame received yet" in stand.text("#state")
         for part in (0, 2, 3):
             await stand.hear(part)
         lines = stand.log()
@@ -157,7 +153,7 @@ def test_a_bad_filter_is_told_and_changes_nothing_and_q_quits(stage: CanStage) -
     async def test(stand: Stand) -> None:
         await stand.press("slash", *"a=q", "enter")  # which are keys of the screen, too
         assert [n.message for n in stand.screen._notifications] == [
-            "'a=q' is no filter; write node=4 kind=nak dir=to (or from) get_*"
+            "'a=q' is not a filter; write node=4 kind=nak dir=to (or from) get_*"
         ]
         assert "filter: none" in stand.text("#state")
         await stand.press("escape")
@@ -180,7 +176,7 @@ def test_memory_is_bounded_and_what_is_left_out_is_said(stage: CanStage) -> None
         await stand.refresh()
         assert len(stand.screen._said) == KEPT
         assert stand.screen.shown == LINES_AT_ONCE
-        assert any("more, too fast to show" in line for line in stand.log())
+        assert any("more omitted" in line for line in stand.log())
         for _ in range(LOG_LINES // LINES_AT_ONCE + 2):
             put(100)
             stand.screen.refresh_now()

@@ -5,12 +5,10 @@ from pathlib import Path
 import pytest
 
 from canbus_tools.bus.bus_load import LoadMeter
-from canbus_tools.monitor.bus_watch import BusWatch
-from canbus_tools.monitor.options import MonitorOptions
+from canbus_tools.monitor.bus_watch import BusWatch, MonitorOptions
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import GUESSED, LEARNT, DictionarySource
-from canbus_tools.protocol.filters import Filter
 from canbus_tools.protocol.frame import Frame
 from canbus_tools.protocol.protocol import Direction
 from canbus_tools.recordings.candump import candump_line
@@ -147,8 +145,8 @@ def test_decode_says_that_it_guessed(tmp_path: Path, capsys: pytest.CaptureFixtu
     said = capsys.readouterr()
     assert "clock clock=" in said.out.splitlines()[-1]
     assert said.err == (
-        f"canductor: node 4: its dictionary (twin {DICTIONARY.version}) is guessed: the cache has it, and it"
-        " explains what was heard; --dictionary 4=FILE makes sure\n"
+        f"canductor: node 4: its dictionary (twin {DICTIONARY.version}) is guessed: a dictionary in the"
+        " cache explains its traffic; give --dictionary 4=FILE to be certain\n"
     )
 
 
@@ -163,7 +161,6 @@ def test_lines_say_once_that_they_are_guessed(
         bus=stage.options,
         bitrate=1_000_000,
         bitrate_is_known=False,
-        filter_=Filter(),
         dictionaries={},
         duration_s=2.0,  # many rounds
     )

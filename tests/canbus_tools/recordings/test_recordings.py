@@ -133,12 +133,24 @@ def test_any_bytes_as_a_candump_log(log: bytes) -> None:
 # -------------------------------------------------------------------------------------- formats of python-can
 
 
+def to_message(frame: Frame) -> can.Message:
+    return can.Message(
+        timestamp=frame.time_s,
+        arbitration_id=frame.can_id,
+        data=frame.data,
+        is_extended_id=frame.kind is FrameKind.EXTENDED,
+        is_remote_frame=frame.kind is FrameKind.REMOTE,
+        is_error_frame=frame.kind is FrameKind.ERROR,
+        is_fd=frame.kind is FrameKind.FD,
+    )
+
+
 @pytest.mark.parametrize(("suffix", "writer"), [("blf", can.BLFWriter), ("asc", can.ASCWriter)])
 def test_blf_and_asc(tmp_path: Path, suffix: str, writer: Callable[[str], can.Listener]) -> None:
     path = tmp_path / f"some.{suffix}"
     log = writer(str(path))
     for frame in FRAMES:
-        message = frame.to_message()
+        message = to_message(frame)
         message.channel = 0
         log.on_message_received(message)
     log.stop()
@@ -153,15 +165,15 @@ def test_truncated_blf(tmp_path: Path) -> None:
     path = tmp_path / "some.blf"
     log = can.BLFWriter(str(path), max_container_size=400)
     for frame in FRAMES * 20:
-        log.on_message_received(frame._replace(channel="").to_message())
+        log.on_message_received(to_message(frame))
     log.stop()
     path.write_bytes(path.read_bytes()[:-150])
     found, problem = read_all(path)
     assert 0 < len(found) < 80
-    assert problem.startswith(f"{path}: is ")
-    assert "cut off" in problem
+    assert problem.startswith(f"{path}: ")
+    assert "truncated" in problem
     path.write_bytes(b"LOGGxxxx")
-    assert read_all(path)[1].startswith(f"{path}: is broken or cut off behind frame 0 (")
+    assert read_all(path)[1].startswith(f"{path}: damaged or truncated after frame 0 (")
 
 
 # ------------------------------------------------------------------------------------------------------- pcap
@@ -220,16 +232,13 @@ def test_captures(tmp_path: Path, form: Callable[..., bytes], order: str, nano: 
     path.write_bytes(whole[:-5])
     found, problem = read_all(path)
     assert [f.can_id for f in found] == [f.can_id for f in FRAMES[:3]]
-    assert (
-        problem
-        == f"{path}: ends in the middle of a packet at byte {len(whole) - 5}; 3 frames before it were read"
-    )
+    assert problem == f"{path}: truncated packet at byte {len(whole) - 5}; the 3 frames before were read"
 
 
 def test_a_capture_of_something_else(tmp_path: Path) -> None:
     path = tmp_path / "some.pcap"
     path.write_bytes(struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
-    assert "captured from something else than CAN (link type 1)" in read_all(path)[1]
+    assert "not captured from a CAN bus (link type 1)" in read_all(path)[1]
 
 
 @given(st.sampled_from([pcap, pcapng]), st.data())
@@ -257,7 +266,7 @@ def test_mcap(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-300])
     found, problem = read_all(path)
     assert found == FRAMES
-    assert problem.startswith(f"{path}: is broken or cut off behind frame 4 (")
+    assert problem.startswith(f"{path}: damaged or truncated after frame 4 (")
 
 
 # ----------------------------------------------------------------------------------------------------- others
@@ -269,4 +278,4 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
     path.write_bytes(b"")
     assert read_all(path)[1] == f"{path}: is empty"
     path.write_bytes(b"\x7fELF\0\0\0")
-    assert "is no recording this tool knows; it reads candump logs, BLF" in read_all(path)[1]
+    assert "unknown format; candump logs, BLF" in read_all(path)[1]

@@ -125,7 +125,7 @@ def test_who_cannot_answer_is_told_in_a_sentence(table: Table, cable: Cable) -> 
     said = table("send", "--device", cable.path, "--axles", 1, "--side", "forward", "--delay", 1)
     assert said.status == 0
     assert "2·l·T = 2·3·1 ms = 0.006 s; with 10 words that begin and end it and 1 LIT 0.017 s" in said.out
-    assert f"nobody confirmed it: what only listens on {cable.path} cannot answer" in said.out
+    assert f"not confirmed: receivers that only listen on {cable.path} cannot answer" in said.out
 
 
 def test_an_empty_table_takes_the_last_one_away(table: Table, cable: Cable) -> None:
@@ -250,7 +250,7 @@ def test_a_node_on_a_serial_line_confirms(table: Table, stage: CanStage) -> None
             ("send", "--device", "/dev/nothing", "--stepper", "1"),
             "/dev/nothing cannot be opened at 250000 baud",
         ),
-        (("status", "--device", "can0"), "only nodes can be asked: give --node ID"),
+        (("status", "--device", "can0"), "only nodes can be queried: give --node ID"),
     ],
 )
 def test_what_cannot_be_asked_for(table: Table, words: tuple[str, ...], sentence: str) -> None:

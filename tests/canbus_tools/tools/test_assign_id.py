@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 
-from canbus_tools.bus.talk import NodeTalk
 from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, NEED_NODEID, QUERY_UNASSIGNED, SET_NODEID
 from nodes.transport import CanFrame
 from nodes.virtual.firmware import TOOLHEAD
@@ -19,7 +18,7 @@ def waiting(can_tool: Command) -> dict[str, Any]:
 
 def ask_uuid(stage: CanStage, nodeid: int) -> bytes:
     async def ask() -> bytes:
-        async with NodeTalk.open(stage.computer, stage.options, nodeid) as talk:
+        async with stage.talk(nodeid) as talk:
             return (await talk.ask("get_canbus_id", "canbus_id")).message.data("canbus_uuid")
 
     return stage.computer.run(ask())
@@ -66,15 +65,15 @@ def test_release_by_uuid_or_id_also_from_shutdown(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ((str(TWIN), "9"), f"two boards on .* have the uuid {TWIN} .*take one of them off"),
-        ((str(BOOT), "9"), f"node {BOOT} is in its bootloader .*flash it, or reset it"),
-        ((str(BED), "4"), f"id {MAIN_ID} on .* belongs to {MAIN}, which would shut down; 6 is free"),
-        ((str(BED), "5"), f"id {TOOL_ID} on .* belongs to {TOOL}, which would shut down; 6 is free"),
+        ((str(TWIN), "9"), f"two boards on .* have the uuid {TWIN} .*disconnect one of them"),
+        ((str(BOOT), "9"), f"node {BOOT} runs its bootloader .*flash it, or reset it"),
+        ((str(BED), "4"), f"id {MAIN_ID} on .* belongs to {MAIN}, which would shut down; the id 6 is free"),
+        ((str(BED), "5"), f"id {TOOL_ID} on .* belongs to {TOOL}, which would shut down; the id 6 is free"),
         ((str(MAIN), "9"), f"node {MAIN} has id 4 already; 'canductor can release 4 "),
         ((str(TOOL), "9"), f"node {TOOL} has id 5 already; 'canductor can release 5 "),
         (
             ("0123456789ab", "9"),
-            r"node 0123456789ab does not wait for an id .*\(those that do: .*canductor can query",
+            r"node 0123456789ab was not found on .*\(nodes that wait for an id: .*canductor can query",
         ),
     ],
 )
@@ -117,7 +116,7 @@ def test_a_node_that_does_not_take_its_id_is_told_of(stage: CanStage, can_tool: 
     with stage.user(lambda frame: answer if frame == question else None):
         said = can_tool("assign", str(BED), "9")
     assert f"{BED} on " in said.sentence
-    assert "was sent the id 9 3 times and still waits for one" in said.sentence
+    assert "3 times, and it still waits for one" in said.sentence
 
 
 def test_release_refuses_what_another_host_uses_unless_forced(six: SixNodes, can_tool: Command) -> None:
@@ -133,7 +132,7 @@ def test_release_refuses_what_another_host_uses_unless_forced(six: SixNodes, can
 def test_release_of_nobody(can_tool: Command) -> None:
     assert "no node answers on id 66 of bus " in can_tool("release", "66").sentence
     stranger = "0123456789ab"
-    assert f"that can be asked has the uuid {stranger}" in can_tool("release", stranger).sentence
+    assert f"no node with the uuid {stranger} was found" in can_tool("release", stranger).sentence
 
 
 def test_release_of_twins_wants_one_named_by_its_id(stage: CanStage, can_tool: Command) -> None:

@@ -16,7 +16,6 @@ from prompt_toolkit.document import Document
 from prompt_toolkit.input import create_pipe_input
 from prompt_toolkit.output import DummyOutput
 
-from canbus_tools.bus.talk import NodeTalk
 from canbus_tools.console.prompt import SessionCompleter, prompt
 from canbus_tools.console.session import Session
 from tests.canbus_tools.command import Command, Said
@@ -119,7 +118,7 @@ def test_an_error_ends_a_script_with_its_line(node: CanStage, can_tool: Command,
     script.write_bytes(b"get_clock\n\xff\xfe\n")
     said = can_tool.console("--node", MAIN_ID, "--script", script)
     assert said.status == 1
-    assert "no text in UTF-8" in said.err
+    assert "is not UTF-8 text" in said.err
 
 
 def test_quit_ends_a_script(on_4: OnNode) -> None:
@@ -204,7 +203,7 @@ def typed(stage: CanStage, keys: str, history: Path, session_type: type[Session]
     said: list[str] = []
 
     async def run() -> None:
-        async with NodeTalk.open(stage.computer, stage.options, MAIN_ID) as talk:
+        async with stage.talk(MAIN_ID) as talk:
             session = session_type(talk, said.append)
             with create_pipe_input() as pipe, create_app_session(input=pipe, output=DummyOutput()):
                 pipe.send_text(keys)
@@ -233,7 +232,7 @@ def test_the_prompt(node: CanStage, tmp_path: Path) -> None:
 
 def test_the_prompt_completes(node: CanStage) -> None:
     async def run() -> list[str]:
-        async with NodeTalk.open(node.computer, node.options, MAIN_ID) as talk:
+        async with node.talk(MAIN_ID) as talk:
             completer = SessionCompleter(Session(talk, print))
             found = completer.get_completions(Document("get_canbus_i"), CompleteEvent())
             return [f"{completion.text} {completion.start_position}" for completion in found]

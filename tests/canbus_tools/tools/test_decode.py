@@ -119,14 +119,14 @@ def test_json(capsys: Output, log: Path, dictionary: Path) -> None:
     assert four["rtt"]["count"] == 1
     assert nine["to_node"]["unknown_messages"] == 1
     assert summary["buses"]["can0"]["other_frames"] == 1
-    assert "give it with --dictionary 9=FILE" in summary["hints"][0]
+    assert "give it by --dictionary 9=FILE" in summary["hints"][0]
 
 
 def test_a_node_without_dictionary_is_told(capsys: Output, log: Path, dictionary: Path) -> None:
     _, errors = decode(capsys, log, "--dictionary", f"4={dictionary}")
     assert errors == (
-        "canductor: node 9: 2 of its blocks could not be read, its dictionary is not in the recording;"
-        " give it with --dictionary 9=FILE\n"
+        "canductor: node 9: 2 of its blocks could not be read, as its dictionary is not in the recording;"
+        " give it by --dictionary 9=FILE\n"
     )
 
 
@@ -198,7 +198,7 @@ def test_what_is_readable_of_a_broken_file_is_shown(capsys: Output, log: Path) -
         ),
         (["-", "--node", "x"], 2, "--node is 'x', must be a whole number from 1 to 255"),
         (["-", "--since", "soon"], 2, "--since is 'soon', must be seconds such as"),
-        (["-", "--message", ""], 2, "--message is empty"),
+        (["-", "--message", ""], 2, "--message is '', must be a message's name"),
     ],
 )
 def test_wrong_words(capsys: Output, words: list[str], status: int, sentence: str) -> None:

@@ -5,9 +5,9 @@ from functools import partial
 
 import pytest
 
+from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.discovery.inventory import Inventory
 from canbus_tools.discovery.node_discovery import NodeDiscovery
-from canbus_tools.doctor.facts import BusAddress as Bus
 from canbus_tools.doctor.facts import NodeFacts
 from canbus_tools.doctor.gather import ASKED
 from canbus_tools.doctor.population import check_nodes
@@ -103,7 +103,7 @@ def test_a_node_that_goes_off_the_bus_while_it_is_asked(stage: CanStage, can_too
     with stage.user(count):
         said = examine(can_tool)
     finding = expect(said, "node-went-silent")["node-went-silent"]
-    assert finding["seen"].startswith(f"node {MAIN_ID} said what it is, and then answered no more: ")
+    assert finding["seen"].startswith(f"node {MAIN_ID} answered its first queries, but no further ones: ")
     assert "bus-off" in finding["means"]
 
 
@@ -123,7 +123,7 @@ def test_quiet_bus_sends_nothing(stage: CanStage, can_tool: Command) -> None:
         text = can_tool("doctor", "-b", BITRATE, "--quiet-bus").words
         assert onlooker.frames == []
     assert (said.status, said.json["checked"][-1]) == (0, "traffic")
-    assert "nothing was heard and nothing was asked" in text
+    assert "no frame was received and nothing was sent" in text
 
 
 def test_other_bit_rates_are_listened_to(capsys: pytest.CaptureFixture[str]) -> None:
@@ -143,7 +143,7 @@ def test_other_bit_rates_are_listened_to(capsys: pytest.CaptureFixture[str]) -> 
 def test_nodes_at_another_bit_rate(socketcan: bool, do: str) -> None:
     nobody = Inventory((), NodeDiscovery().result(), ())
     facts = NodeFacts(inventory=nobody, heard_at={1_000_000: 0, 250_000: 37})
-    bus = Bus(name="can0", words="-c can0", socketcan=socketcan, bitrate=1_000_000)
+    bus = BusOptions(interface="socketcan" if socketcan else "gs_usb")
     (finding,) = check_nodes(facts, bus)
     assert finding.name == "other-bitrate"
     assert "37 frames were heard at 250000 bit/s" in finding.seen

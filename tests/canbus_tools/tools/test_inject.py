@@ -218,7 +218,7 @@ def test_faults_are_read(name: str, text: str, expected: BusFault) -> None:
         ("loss", "1%,id=1/x", "--loss's id is 'x', must be a number"),
         ("loss", "1%,colour=red", "--loss has 'colour=red', must be one of id=, sender="),
         ("loss", "1%,id=1,id=2", "--loss has id= twice"),
-        ("loss", "1%,sender=hotend", "--loss: no node 'hotend' is started here, only toolhead"),
+        ("loss", "1%,sender=hotend", "--loss: unknown node 'hotend'; the nodes are toolhead"),
         ("loss", "1%,sender=64", "--loss's client is '64', must be a whole number from 0 to 63"),
         ("loss", "1%,from=2,until=1", "--loss: fault lose: end 1 is not between 2"),
         ("loss", "1%,jitter=1ms", "--loss has no jitter="),
@@ -229,7 +229,7 @@ def test_faults_are_read(name: str, text: str, expected: BusFault) -> None:
         ("delay", "nan", "--delay is 'nan', must be a number with the unit us"),
         ("delay", "share=1%", "--delay needs a time first, as in --delay 5ms,jitter=2ms"),
         ("bus-off", "2s", "--bus-off needs at=SECONDS, share= or frame= to know when"),
-        ("bus-off", "2s,at=5,id=1", "--bus-off with at= takes only sender= besides"),
+        ("bus-off", "2s,at=5,id=1", "--bus-off with at= takes no other key than sender="),
         ("bus-off", "0,at=5", "--bus-off: fault bus_off: its time must be above 0 s"),
     ],
 )

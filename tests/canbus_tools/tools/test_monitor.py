@@ -10,10 +10,8 @@ import pytest
 
 from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.bus.computer import Listener, now_s
-from canbus_tools.monitor.bus_watch import SPAN_S, BusWatch
-from canbus_tools.monitor.options import MonitorOptions
+from canbus_tools.monitor.bus_watch import SPAN_S, BusWatch, MonitorOptions
 from canbus_tools.protocol.decoder import BusDecoder
-from canbus_tools.protocol.filters import Filter
 from canbus_tools.protocol.frame import Frame
 from canbus_tools.tools.monitor import Lines, fetch
 from nodes.support.errors import CanductorError
@@ -101,7 +99,7 @@ def test_dictionaries_are_fetched_when_asked(six: SixNodes, can_tool: Command) -
         fetched("9")
     with stage.asking_host(MAIN_ID, every_s=0.5):
         said = can_tool("monitor", "--fetch", "all", "--duration", "2")
-    assert "canductor: node 4 was not asked: another host uses it\n" in said.err
+    assert "canductor: node 4 was not queried: another host uses it\n" in said.err
     assert "no node" not in said.out
 
 
@@ -149,7 +147,6 @@ def lines_of(stage: CanStage, queue: Listener, duration_s: float) -> int:
         bus=stage.options,
         bitrate=1_000_000,
         bitrate_is_known=False,
-        filter_=Filter(),
         dictionaries={},
         duration_s=duration_s,
     )
@@ -165,7 +162,7 @@ def test_dropped_frames_are_told_now_and_then(stage: CanStage, capsys: Captured)
         assert lines_of(stage, queue, 0.2) == 5
     said = capsys.readouterr()
     assert said.out.count("set_nodeid") == 5
-    assert said.err == "canductor: 45 frames were dropped until now: lines are read too slowly\n"
+    assert said.err == "canductor: dropped 45 frames so far: lines are read too slowly\n"
 
 
 class Interrupted(io.StringIO):

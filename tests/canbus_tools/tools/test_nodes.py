@@ -80,8 +80,8 @@ def test_again_and_as_a_table(six: SixNodes, can_tool: Command) -> None:
     assert rows[str(TWIN)] == f"- {TWIN} Klipper-type waits for an id, two boards!"
     assert rows[str(BOOT)] == f"- {BOOT} Katapult in its bootloader"
     assert f"Two boards have the uuid {TWIN}" in said.words
-    assert f"Node {TOOL_ID} has shut down" in said.words
-    assert f"Node {BOOT} runs no firmware" in said.words
+    assert f"Node {TOOL_ID} is shut down" in said.words
+    assert f"Node {BOOT} runs its bootloader" in said.words
 
 
 def test_a_node_in_use_is_listed_and_left_alone(six: SixNodes, can_tool: Command) -> None:
@@ -96,7 +96,7 @@ def test_a_node_in_use_is_listed_and_left_alone(six: SixNodes, can_tool: Command
     assert set(witness.sent_to(MAIN_ID)) == {block}
     assert DAMAGED_BLOCK in witness.sent_to(TOOL_ID)
     assert "in use by a host" in text.out
-    assert "Nodes in use were not asked" in text.words
+    assert "Nodes in use were not queried" in text.words
 
 
 def test_a_klipper_board_in_use_is_known_by_its_id(six: SixNodes, can_tool: Command) -> None:
@@ -106,7 +106,7 @@ def test_a_klipper_board_in_use_is_known_by_its_id(six: SixNodes, can_tool: Comm
     assert (tool["uuid"], tool["application"], tool["state"]) == (None, "klipper-type", "in use")
     nobody = nodes[30]
     assert (nobody["state"], nobody["application"]) == ("unclear", "unknown")
-    assert nobody["trouble"] == "another program sends to this id, and nobody answers"
+    assert nobody["trouble"] == "another program sends to this id, but no node answers"
 
 
 def test_a_probe_is_answered_and_changes_nothing_in_a_node(stage: CanStage) -> None:
@@ -164,10 +164,10 @@ def test_nobody(stage: CanStage, can_tool: Command) -> None:
     said = can_tool("nodes")
     assert said.status == 0
     assert said.out.startswith("0 nodes on ")
-    assert "of ids 4 to 67 none answered" in said.words
+    assert "none of ids 4 to 67 answered" in said.words
     with stage.other_host(0x300):  # far above the ids of nodes: another protocol
         said = can_tool("nodes")
-    assert "of other protocols came by" in said.words
+    assert "of other protocols were seen" in said.words
 
 
 @pytest.mark.parametrize("ids", ["0-9", "9-4", "x", "4-256", ""])

@@ -116,8 +116,10 @@ def test_a_full_disk_is_one_sentence(stage: CanStage, can_tool: Command, tmp_pat
     stage.replay(session() * 20 if suffix == "log" else session())
     said = can_tool("record", "-o", path, "--json", "--force", "--duration", "5")
     assert said.status == 1
-    assert said.json["error"].startswith(f"'{path}' cannot be written: No space left on device, after ")
-    assert said.json["error"].endswith(" frames; make room, or record elsewhere")
+    assert said.json["error"].startswith(f"writing '{path}' failed after ")
+    assert said.json["error"].endswith(
+        " frames: No space left on device; free some space, or record elsewhere"
+    )
 
 
 @pytest.mark.parametrize("suffix", ["log", "mcap"])
@@ -150,7 +152,7 @@ def test_a_file_is_not_overwritten_by_mistake(capsys: Output, tmp_path: Path) ->
     path = tmp_path / "some.log"
     path.write_text("precious")
     assert main(["can", "record", "-o", str(path)]) == 2
-    assert f"'{path}' exists already; --force overwrites it" in capsys.readouterr().err
+    assert f"'{path}' exists already; give --force to overwrite it" in capsys.readouterr().err
     assert path.read_text() == "precious"
 
 
