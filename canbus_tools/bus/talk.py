@@ -20,7 +20,7 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.message_format import Message, Value
 from nodes.dictionary.parts import DictionaryError
 from nodes.link import Frame, LinkIO, LinkSettings, LinkStats
-from nodes.link.interfaces import ResponseLike
+from nodes.link.types import Response
 from nodes.mt.download import SLOW_BITRATE
 from nodes.node.errors import NodeLost
 from nodes.node.identify import identify
@@ -267,7 +267,7 @@ class NodeTalk(RequestReply):
         if link is not None:
             link.close()
 
-    def receive(self, responses: Sequence[ResponseLike]) -> None:
+    def receive(self, responses: Sequence[Response]) -> None:
         """Handle the responses that the link received."""
         if self._observers:
             for response in responses:
