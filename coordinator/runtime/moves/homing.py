@@ -51,6 +51,19 @@ class HomingError(CanductorError):
     """An axis could not be homed; the sentence says why and what to do."""
 
 
+class AlreadyPressedError(HomingError):
+    """The endstop was pressed before the move towards it."""
+
+
+class EndstopNotFoundError(HomingError):
+    """The endstop did not switch on the whole way."""
+
+    def __init__(self, sentence: str, way_mm: float) -> None:
+        super().__init__(sentence)
+        self.way_mm = way_mm
+        """How long that was."""
+
+
 class _LateError(HomingError):
     """The nodes were not armed in time; all are stopped again."""
 
@@ -150,6 +163,14 @@ class HomingMove:
         self._ramp = Ramp(way_mm, speed, accel)
         self._heard_s: dict[tuple[int, str], float] = {}
         self._changed = asyncio.Event()
+        self._move: SingleMove | None = None
+
+    @property
+    def planned_way_mm(self) -> float:
+        """How far the move has led by now, as it was planned; 0 before it begins."""
+        if self._move is None:
+            return 0.0
+        return self._ramp.way_at(self._move.print_time_now() - self._move.begin_s)
 
     async def run(self) -> tuple[HomingResult, ...]:
         """Move until every endstop switched; raises HomingError with everything stopped."""
@@ -165,12 +186,13 @@ class HomingMove:
         for rail in self._rails:
             node = self._machine.nodes[devices.endstop_node(rail)]
             if await self._is_pressed(rail, node):
-                raise HomingError(
+                raise AlreadyPressedError(
                     f"the endstop of axis {rail.axis} is pressed before the move towards it; move the axis "
                     "away by hand, or check the endstop's wiring and whether its pin has to be inverted"
                 )
         began_at = await self._machine.query_stepper_counts()
         move = SingleMove(self._machine, self._ramp, self._ratio, ways=self._ways, lead_s=lead_s)
+        self._move = move
         legs = [self._leg(slot, rail, move) for slot, rail in enumerate(self._rails)]
         ends: list[Callable[[], None]] = []
         late: _LateError | None = None
@@ -326,9 +348,10 @@ class HomingMove:
                     f"{leg.timeout_s:g} s and stopped by itself; check the bus for errors and load"
                 )
         if not _switched(leg, states):
-            raise HomingError(
+            raise EndstopNotFoundError(
                 f"axis {leg.name} moved {self._ramp.way_mm:g} mm and its endstop did not switch; "
-                "check the endstop's wiring, the direction of the axis, and homing_positive_dir"
+                "check the endstop's wiring, the direction of the axis, and homing_positive_dir",
+                self._ramp.way_mm,
             )
 
     # ------------------------------------------------------------------------------------------ afterwards
