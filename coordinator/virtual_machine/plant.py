@@ -126,8 +126,10 @@ def _mechanics(
 
 def _probe(description: MachineDescription, start: Point, settings: PlantSettings) -> ProbeParts | None:
     """Return the probe with its axes; None: there is none, or X and Y are no sums of motors."""
+    if description.probe is None:
+        return None
     terms = [_axis_terms(description, replace(description.rails[0], axis=letter)) for letter in AXES]
-    if description.probe is None or not all(terms):
+    if not all(terms):
         return None
     axes = [Axis(name=f"probe_{a}", terms=t, origin=o) for a, t, o in zip(AXES, terms, start, strict=True)]
     return probe_parts(description, axes, settings.bed)

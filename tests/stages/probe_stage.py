@@ -1,7 +1,7 @@
 """A machine with a probe above a virtual bed, in virtual time; the truth about it by formulas of its own.
 
-X and Y have no endstops: G28 takes them as home at 0, where the head begins. The probe is on another node than the
-motors, unless the configuration says otherwise.
+X and Y have no endstops: G28 takes them as home at 0, where the head begins. The probe is on another node
+than the motors.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -9,6 +9,7 @@ from pathlib import Path
 
 from coordinator.runtime.machine import Machine
 from coordinator.simulate.scenario import BusSetting
+from coordinator.support.toml_values import Range
 from coordinator.virtual_machine.plant import PlantSettings
 from coordinator.virtual_machine.plant_bed import BedSettings
 from nodes.virtual.plant import Bed
@@ -67,7 +68,7 @@ class ProbeStage(MachineStage):
     ) -> None:
         path = folder / "probe.cfg"
         path.write_text(text or machine_text(), encoding="utf-8")
-        buses = {"can0": BusSetting(loss=(loss, loss))} if loss else None
+        buses = {"can0": BusSetting(loss=Range(loss, loss))} if loss else None
         self.bed = bed or BedSettings()
         self.output: list[str] = []
         self.machine: Machine | None = None
@@ -89,6 +90,24 @@ class ProbeStage(MachineStage):
         """Let the probe fail."""
         self.page(self.probe_node).set_fault(PlantItemKind.SWITCH, "probe", fault)
 
+    def when(self, true: Callable[[], bool], what: Callable[[], object], look_s: float = 0.005) -> None:
+        """Call WHAT as soon as it is seen to be TRUE."""
+
+        def look() -> None:
+            if true():
+                what()
+            else:
+                self.at(look_s, look)
+
+        self.at(look_s, look)
+
+    def fault_above(self, z: float, fault: PlantFault) -> None:
+        """Let the probe fail when the head has been low and is truly at Z or higher."""
+        self.when(
+            lambda: self.true_mm("z") < z,
+            lambda: self.when(lambda: self.true_mm("z") >= z, lambda: self.fault(fault)),
+        )
+
     @property
     def probe_node(self) -> str:
         """The node of the probe."""
@@ -98,7 +117,7 @@ class ProbeStage(MachineStage):
         return probe.rail.homing.endstop_pin.node
 
     def trigger_z(self, x: float, y: float) -> float:
-        """Return the height above the frame's zero at which the nozzle at X, Y triggers the probe, exactly."""
+        """Return the height at which the nozzle at X, Y triggers the probe, exactly."""
         return bed_height(self.bed.shape, x + OFFSET[0], y + OFFSET[1]) + OFFSET[2]
 
 

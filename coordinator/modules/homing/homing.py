@@ -149,7 +149,7 @@ class Homing(Module):
             if rail.homing.waits:
                 return (
                     f"the endstop {rail.homing.virtual_endstop} ({rail.place}) is not supported yet; give the"
-                    " axis a switch as its endstop_pin"
+                    " axis a switch as its endstop_pin, or add [probe]"
                 )
         for stepper in self._described.motors:
             if stepper.name in approach.ways and stepper.unpowered:

@@ -164,13 +164,16 @@ class HomingMove:
         self._heard_s: dict[tuple[int, str], float] = {}
         self._changed = asyncio.Event()
         self._move: SingleMove | None = None
+        self._ends_at_s = 0.0
+        """Print time at which one of the nodes stops by itself when it hears nothing more."""
 
     @property
     def planned_way_mm(self) -> float:
-        """How far the move has led by now, as it was planned; 0 before it begins."""
+        """How far the move can have led by now, as it was planned and before nodes stop by themselves, mm."""
         if self._move is None:
             return 0.0
-        return self._ramp.way_at(self._move.print_time_now() - self._move.begin_s)
+        until_s = min(self._move.print_time_now(), self._ends_at_s)
+        return self._ramp.way_at(until_s - self._move.begin_s)
 
     async def run(self) -> tuple[HomingResult, ...]:
         """Move until every endstop switched; raises HomingError with everything stopped."""
@@ -192,7 +195,7 @@ class HomingMove:
                 )
         began_at = await self._machine.query_stepper_counts()
         move = SingleMove(self._machine, self._ramp, self._ratio, ways=self._ways, lead_s=lead_s)
-        self._move = move
+        self._move, self._ends_at_s = move, move.begin_s + TIMEOUT_ALONE_S
         legs = [self._leg(slot, rail, move) for slot, rail in enumerate(self._rails)]
         ends: list[Callable[[], None]] = []
         late: _LateError | None = None
@@ -321,6 +324,7 @@ class HomingMove:
         heard_s = min(self._heard_s[leg.slot, node.name] for node, _ in leg.syncs)
         if leg.triggered.is_set() or heard_s <= move.begin_s:
             return
+        self._ends_at_s = heard_s + leg.timeout_s
         for node, sync in leg.syncs:
             sync.renew(node, move.ticks_at(node.name, heard_s + leg.timeout_s))
 

@@ -4,6 +4,7 @@ The place follows from the nodes' step counts and from the moment at which the p
 how far the head went on afterwards does not matter.
 """
 
+import asyncio
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -11,7 +12,7 @@ from typing import Final
 from coordinator.config.model import MachineDescription, ProbeDescription
 from coordinator.gcode.commands import Position
 from coordinator.kinematics.base import Point
-from coordinator.runtime.machine import Machine, MachineStopped
+from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.homing import (
     AlreadyPressedError,
     EndstopNotFoundError,
@@ -99,12 +100,16 @@ class ProbingMove:
         )
         try:
             (result,) = await move.run()
-        except MachineStopped:
-            reached = begin[2] - move.planned_way_mm
-            self._say(f"the machine stopped while the probe was lowered: Z is about {reached:.3f} mm")
-            raise
-        except CanductorError as error:
-            raise HomingError(f"{in_words_of_the_probe(error)}; Z is {await self._reached()}") from error
+        except (CanductorError, asyncio.CancelledError) as error:
+            lowest_z = begin[2] - move.planned_way_mm
+            if self._machine.stopped is not None:
+                self._say(
+                    f"the machine stopped while the probe was lowered: Z is {lowest_z:.3f} mm or higher"
+                )
+            if self._machine.stopped is not None or isinstance(error, asyncio.CancelledError):
+                raise
+            reached = await self._reached() or f"{lowest_z:.3f} mm or higher"
+            raise HomingError(f"{in_words_of_the_probe(error)}; Z is {reached}") from error
         end = await self._place()
         return Contact((*end, self._position[3]), begin[2] - result.way_to_trigger_mm)
 
@@ -120,7 +125,7 @@ class ProbingMove:
             place = await place_by_steps(self._machine)
         except CanductorError:
             place = None
-        return "not known" if place is None else f"{place[2]:.3f} mm"
+        return "" if place is None else f"{place[2]:.3f} mm"
 
 
 async def place_by_steps(machine: Machine) -> Point | None:
