@@ -17,7 +17,9 @@ from coordinator.modules.heaters.sections import ExtruderHeaterSection, HeaterBe
 from coordinator.modules.heaters.verify_heater import VerifyHeater
 from coordinator.modules.homing.homing_override import HomingOverride
 from coordinator.modules.homing.safe_z_home import SafeZHome
+from coordinator.modules.levelling.quad_gantry_level import QuadGantryLevel
 from coordinator.modules.levelling.skew_correction import SkewCorrection
+from coordinator.modules.levelling.z_tilt import ZTilt
 from coordinator.modules.motion.firmware_retraction import FirmwareRetraction
 from coordinator.modules.motion.force_move import ForceMove
 from coordinator.modules.motion.gcode_arcs import GCodeArcs
@@ -62,6 +64,7 @@ MODULES: Final[dict[str, type[Module]]] = {
     "pause_resume": PauseResume,
     "pid_profile": PidProfile,
     "probe": SwitchProbe,
+    "quad_gantry_level": QuadGantryLevel,
     "respond": Respond,
     "safe_z_home": SafeZHome,
     "save_variables": SaveVariables,
@@ -74,6 +77,7 @@ MODULES: Final[dict[str, type[Module]]] = {
     "thermistor": Thermistor,
     "verify_heater": VerifyHeater,
     "virtual_sdcard": VirtualSdcard,
+    "z_tilt": ZTilt,
 }
 """Our modules, by the section's first word."""
 _OPTION_READERS: Final[dict[str, type[Module]]] = {r"extruder[0-9]*": ExtruderHeaterSection}

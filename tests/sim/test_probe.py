@@ -5,6 +5,7 @@ The probe is on the tool head's node, the motors are on the other one.
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,7 +67,7 @@ def test_the_probe_may_be_beside_a_switch_that_is_the_endstop_of_z(tmp_path: Pat
 # --------------------------------------------------------------------------------------------------- options
 
 
-def measured(folder: Path, command: str = "PROBE", *, noise_mm: float = 0.0, **probe: object) -> list[str]:
+def measured(folder: Path, command: str = "PROBE", *, noise_mm: float = 0.0, **probe: Any) -> list[str]:
     """Return what COMMAND says at Z 6, of a probe with these options."""
     stage = ProbeStage(folder, machine_text(**probe), bed=BedSettings(noise_mm=noise_mm))
     return stage.do("G28", "G1 Z6 F900", command)
@@ -98,7 +99,7 @@ def test_the_first_result_may_be_dropped(tmp_path: Path) -> None:
 
 
 def test_samples_too_far_apart_are_taken_again_and_then_refused(tmp_path: Path) -> None:
-    options = {"samples": 2, "samples_tolerance": 0.0005, "samples_tolerance_retries": 2}
+    options: dict[str, Any] = {"samples": 2, "samples_tolerance": 0.0005, "samples_tolerance_retries": 2}
     output: list[str] = []
     stage = ProbeStage(tmp_path, machine_text(**options), bed=BedSettings(noise_mm=0.05))
     stage.output = output
@@ -133,7 +134,7 @@ def _steps(stage: ProbeStage) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("each", "times"), [(True, 3), (False, 1)])
 def test_lines_make_it_ready_and_put_it_away(tmp_path: Path, each: bool, times: int) -> None:
-    lines = {"activate_gcode": "M118 out", "deactivate_gcode": "M118 in"}
+    lines: dict[str, Any] = {"activate_gcode": "M118 out", "deactivate_gcode": "M118 in"}
     output = measured(tmp_path, "PROBE SAMPLES=3", deactivate_on_each_sample=each, **lines)
     told = [text for text in output if text.startswith("echo")]
     assert told == ["echo: out", "echo: in"] * (1 + times), "once around homing"
@@ -149,7 +150,7 @@ def test_lines_must_leave_the_head_where_it_is(tmp_path: Path) -> None:
 
 
 def test_safe_z_home_runs_the_lines_around_z_alone(tmp_path: Path) -> None:
-    lines = {"activate_gcode": "M118 out\n  M114", "deactivate_gcode": "M118 in\n  M114"}
+    lines: dict[str, Any] = {"activate_gcode": "M118 out\n  M114", "deactivate_gcode": "M118 in\n  M114"}
     safe = "[safe_z_home]\nhome_xy_position: 100, 90\nz_hop: 9\nmove_to_previous: True\n"
     stage = ProbeStage(tmp_path, machine_text(sections=safe, **lines), bed=TILTED)
     output = stage.do("G28", "M114")

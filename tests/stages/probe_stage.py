@@ -48,7 +48,7 @@ def machine_text(
             stepper_section(f"stepper_z{number}", f"PD{number}", f"PE{number}", rotation_distance=8)
             for number in range(1, further_z + 1)
         )
-        + section("probe", **PROBE | probe)
+        + section("probe", **{**PROBE, **probe})
         + sections
     )
 

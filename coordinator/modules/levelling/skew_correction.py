@@ -5,7 +5,7 @@ believe to be at x, y, z. So steppers follow the other way round: it is a change
 """
 
 import math
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -17,6 +17,7 @@ from coordinator.gcode.commands import (
     Call,
     GCodeCommand,
     Immediate,
+    Phases,
     Position,
     ProgramContext,
     Reading,
@@ -161,11 +162,21 @@ class Skews(Module):
 
         def homing(call: Call, axes: str) -> Reading:
             reading = read(call, axes)
+            if isinstance(reading, Phases):
+                return Phases(lambda job: self._corrected_phases(reading, job, call.command))
             if isinstance(reading, AtStandstill):
                 return AtStandstill(self._corrected(reading.perform, call))
             return reading
 
         return homing
+
+    def _corrected_phases(self, phases: Phases, job: ProgramContext, command: Command) -> Iterator[Reading]:
+        for reading in phases.run(job):
+            if isinstance(reading, AtStandstill):
+                call = job.call(command)
+                yield AtStandstill(self._corrected(reading.perform, call), reading.planned)
+            else:
+                yield reading
 
     def _corrected(
         self, perform: Callable[[], Awaitable[Done | None]], call: Call

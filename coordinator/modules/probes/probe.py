@@ -26,6 +26,7 @@ from coordinator.gcode.commands import (
     Call,
     Immediate,
     Lines,
+    Position,
     ProgramContext,
     Reading,
     ToProgram,
@@ -33,8 +34,9 @@ from coordinator.gcode.commands import (
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.kinematics.base import Point
-from coordinator.modules.base import Build
+from coordinator.modules.base import Build, Modules
 from coordinator.modules.homing.virtual_endstop import ProbeEndstop
+from coordinator.modules.levelling.skew_correction import Skews
 from coordinator.modules.probes.samples import AVERAGE, MEDIAN, SampleRules, SampleSeries
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, parameters
@@ -121,8 +123,19 @@ Phase = Generator[Reading, None, Measured | None]
 
 
 OPTIONS: Final[tuple[Option[Any], ...]] = (
-    *(*OFFSETS, Z_OFFSET, SPEED, LIFT_SPEED, SAMPLES, RETRACT, RESULT, TOLERANCE, RETRIES, DROP_FIRST),
-    *(ACTIVATE, DEACTIVATE, EACH),
+    *OFFSETS,
+    Z_OFFSET,
+    SPEED,
+    LIFT_SPEED,
+    SAMPLES,
+    RETRACT,
+    RESULT,
+    TOLERANCE,
+    RETRIES,
+    DROP_FIRST,
+    ACTIVATE,
+    DEACTIVATE,
+    EACH,
 )
 """Of every probe."""
 
@@ -159,8 +172,13 @@ class Probe(ProbeEndstop):
             )
         self._lowest_z = build.machine.limits.position_min[2]
         self._live: ModuleContext | None = None
+        self._skews: Skews | None = None
         self.last_query = False
         self._last: Measured | None = None
+
+    def link(self, modules: Modules) -> None:
+        """Find what makes X and Y of programs others than those of the motors."""
+        self._skews = modules.find("skew_correction", Skews)
 
     async def connect(self, live: ModuleContext) -> None:
         """Take over the machine."""
@@ -275,11 +293,12 @@ class Probe(ProbeEndstop):
                 say=self._live.say,
             )
             try:
-                found.append(await move.run())
+                contact = await move.run()
             except CanductorError as error:
                 if self._live.machine.stopped is not None:
                     raise
                 raise CanductorError(f"{command.name} failed: {error}") from error
+            found.append(replace(contact, position=self._to_program(contact.position)))
             return Done(position=found[0].position, moved=True)
 
         yield AtStandstill(go_down)
@@ -288,6 +307,10 @@ class Probe(ProbeEndstop):
         if self._each:
             yield from self._run_lines(job, command, self._deactivate)
         return found[0]
+
+    def _to_program(self, believed: Position) -> Position:
+        """Return where the head is for programs when the motors stand at BELIEVED."""
+        return believed if self._skews is None else self._skews.now.made(believed)
 
     def _found(self, contact: Contact, height: float) -> Measured:
         x, y, _ = contact.trigger
