@@ -56,7 +56,6 @@ _TABLE: Final[tuple[tuple[Effect, tuple[str, ...], str], ...]] = (
     (Effect.LEVELS, ("z_tilt_ng",), "Z_TILT_CALIBRATE Z_TILT_AUTODETECT"),
     (Effect.LEVELS, ("quad_gantry_level",), "QUAD_GANTRY_LEVEL"),
     (Effect.LEVELS, ("bed_tilt",), "BED_TILT_CALIBRATE"),
-    (Effect.LEVELS, ("bed_screws",), "BED_SCREWS_ADJUST ADJUSTED"),
     (Effect.LEVELS, ("screws_tilt_adjust",), "SCREWS_TILT_CALCULATE"),
     (Effect.LEVELS, ("delta_calibrate",), "DELTA_CALIBRATE DELTA_ANALYZE"),
     (Effect.LEVELS, ("axis_twist_compensation",), "AXIS_TWIST_COMPENSATION_CALIBRATE"),

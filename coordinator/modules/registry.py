@@ -17,7 +17,9 @@ from coordinator.modules.heaters.sections import ExtruderHeaterSection, HeaterBe
 from coordinator.modules.heaters.verify_heater import VerifyHeater
 from coordinator.modules.homing.homing_override import HomingOverride
 from coordinator.modules.homing.safe_z_home import SafeZHome
+from coordinator.modules.levelling.bed_screws import BedScrews
 from coordinator.modules.levelling.quad_gantry_level import QuadGantryLevel
+from coordinator.modules.levelling.screws_tilt_adjust import ScrewsTiltAdjust
 from coordinator.modules.levelling.skew_correction import SkewCorrection
 from coordinator.modules.levelling.z_tilt import ZTilt
 from coordinator.modules.motion.firmware_retraction import FirmwareRetraction
@@ -43,6 +45,7 @@ ENTRY_POINTS: Final = "canductor.modules"
 """Name: the section's first word; value: ``package.module:Class``."""
 MODULES: Final[dict[str, type[Module]]] = {
     "adc_temperature": AdcTemperature,
+    "bed_screws": BedScrews,
     "controller_fan": ControllerFan,
     "delayed_gcode": DelayedGCode,
     "display_status": DisplayStatus,
@@ -68,6 +71,7 @@ MODULES: Final[dict[str, type[Module]]] = {
     "respond": Respond,
     "safe_z_home": SafeZHome,
     "save_variables": SaveVariables,
+    "screws_tilt_adjust": ScrewsTiltAdjust,
     "skew_correction": SkewCorrection,
     "static_digital_output": StaticDigitalOutput,
     "temperature_fan": TemperatureFan,

@@ -5,7 +5,7 @@ TESTZ also halves: between the height at hand and the next one that was tried ab
 
 from bisect import insort
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.builtins.state import go
@@ -24,6 +24,20 @@ SAME_MM: Final = 1e-6
 _BEGUN: Final = "now move with TESTZ Z=-0.1 (+, -, ++, --) until it fits; end with ACCEPT or ABORT"
 
 
+class TakesAnswers(Protocol):
+    """Another search that ACCEPT and ABORT answer while it is active."""
+
+    @property
+    def is_active(self) -> bool:
+        """Whether it waits for an answer."""
+
+    def read_accept(self, call: Call) -> Reading:
+        """Return what ACCEPT does."""
+
+    def read_abort(self, call: Call) -> Reading:
+        """Return what ABORT does."""
+
+
 class ManualProbe(Module):
     """The commands; one search at a time."""
 
@@ -36,6 +50,8 @@ class ManualProbe(Module):
         self._live: ModuleContext | None = None
         self._accepted: Callable[[float], tuple[str, ...]] | None = None
         """What a height that is accepted leads to; None: nothing is looked for."""
+        self.other: TakesAnswers | None = None
+        """Another search, such as that for the turns of screws."""
         self._speed = SPEED
         self._tried: list[float] = []
         self._z = 0.0
@@ -115,7 +131,7 @@ class ManualProbe(Module):
         """Raise WordError where no height can be looked for."""
         if "Z" not in call.homed:
             raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
-        if self._accepted is not None:
+        if self._accepted is not None or (self.other is not None and self.other.is_active):
             raise WordError(f"{call.command.name}: a height is looked for already; ACCEPT or ABORT that")
 
     def begin(
@@ -184,6 +200,8 @@ class ManualProbe(Module):
 
     def _read_accept(self, call: Call) -> Reading:
         call.parameters()
+        if self.other is not None and self.other.is_active:
+            return self.other.read_accept(call)
         accepted = self._check_active(call)
 
         async def accept() -> Done:
@@ -194,6 +212,8 @@ class ManualProbe(Module):
 
     def _read_abort(self, call: Call) -> Reading:
         call.parameters()
+        if self.other is not None and self.other.is_active:
+            return self.other.read_abort(call)
         self._check_active(call)
 
         async def abort() -> Done:
