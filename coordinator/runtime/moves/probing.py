@@ -21,7 +21,7 @@ from coordinator.runtime.moves.homing import (
 )
 from nodes.support.errors import CanductorError
 
-STRAIGHT_DOWN: Final = ("delta",)
+STRAIGHT_DOWN: Final = ("delta", "deltesian")
 """Kinematics whose motors are no sums of axes, but go along with Z by as much."""
 SHORTEST_MM: Final = 1e-3
 """Of a way down: less is none."""
@@ -47,9 +47,10 @@ def downwards(described: MachineDescription) -> Mapping[str, float] | None:
     straight = described.kinematics.name in STRAIGHT_DOWN
     ways = {}
     for motor in described.motors:
-        if not motor.function.linear and not straight:
+        function = motor.function
+        if not function.linear and "z" in function.axes and not straight:
             return None
-        way = motor.weights[2] if motor.function.linear else 1.0
+        way = motor.weights[2] if function.linear else float("z" in function.axes)
         if way:
             ways[motor.name] = -way
     return ways or None
