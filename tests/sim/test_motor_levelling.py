@@ -151,6 +151,15 @@ def test_places_may_be_those_of_the_probe(tmp_path: Path) -> None:
     assert where[:3] == ["30.000,100.000", "190.000,20.000", "190.000,190.000"]
 
 
+def test_the_head_travels_as_fast_as_configured(tmp_path: Path) -> None:
+    """By the times of the steps of X: 80 a millimetre."""
+    stage = make(tmp_path, "z_tilt", {"stepper_z1": 0.5}, speed=90, retries=0)
+    stage.do("G28", "G1 Z9 F600", "Z_TILT_ADJUST")
+    at = np.array([at for at, level in stage.edges("PB0", "mcu") if level])
+    fastest_s = (at[40:] - at[:-40]).min() / 40
+    assert 1 / (80 * fastest_s) == pytest.approx(90 * np.cos(np.arctan2(80, 160)), rel=0.02)
+
+
 def test_the_head_travels_as_high_as_it_is_told(tmp_path: Path) -> None:
     stage = make(tmp_path, "z_tilt", {"stepper_z1": 0.5})
     output = stage.do("G28", "G1 Z9 F600", "Z_TILT_ADJUST HORIZONTAL_MOVE_Z=6", "M114")

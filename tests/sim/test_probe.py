@@ -64,6 +64,27 @@ def test_the_probe_may_be_beside_a_switch_that_is_the_endstop_of_z(tmp_path: Pat
     assert output[-2:] == ["probe: TRIGGERED", "probe: open"]
 
 
+ONE_NODE = {"pin": "^PC5"}
+SIDES = "step_pin: PD1\ndir_pin: PE1", "step_pin: toolhead:PD1\ndir_pin: toolhead:PE1"
+
+
+@pytest.mark.parametrize(
+    ("options", "further_z", "nodes"), [(ONE_NODE, 0, 1), (ONE_NODE, 1, 2), ({}, 1, 2), ({}, 0, 2)]
+)
+def test_probe_and_motors_may_be_on_any_nodes(
+    tmp_path: Path, options: dict[str, Any], further_z: int, nodes: int
+) -> None:
+    """Also the two motors of Z on one node each."""
+    text = machine_text(further_z=further_z, **options)
+    assert further_z == text.count(SIDES[0])
+    stage = ProbeStage(tmp_path, text.replace(*SIDES), bed=TILTED)
+    at_work = {stage.probe_node, *(motor.node for motor in stage.description.rails[2].steppers)}
+    assert len(at_work) == nodes
+    output = stage.do("G28", "G1 Z5 F600", "G1 X60 Y30 F6000", "PROBE")
+    exact = OFFSET[2] + stage.trigger_z(60, 30) - stage.trigger_z(0, 0)
+    assert heights(output) == [pytest.approx(exact, abs=MICROSTEP_MM)]
+
+
 # --------------------------------------------------------------------------------------------------- options
 
 
@@ -159,6 +180,23 @@ def test_safe_z_home_runs_the_lines_around_z_alone(tmp_path: Path) -> None:
     ]
     assert abs(zero_error(stage, 100, 90)) < MICROSTEP_MM
     assert float(output[-1].split("Z:")[1].split()[0]) == pytest.approx(9, abs=MICROSTEP_MM)
+
+
+def test_homing_override_homes_z_where_it_says(tmp_path: Path) -> None:
+    override = """[homing_override]
+gcode:
+  {% if 'Z' in rawparams or not rawparams %}
+  G28 X Y
+  G0 X80 Y50 F6000
+  G28 Z
+  G0 Z9
+  {% else %}
+  G28 {rawparams}
+  {% endif %}
+"""
+    stage = ProbeStage(tmp_path, machine_text(sections=override, activate_gcode="M118 out"), bed=TILTED)
+    assert stage.do("G28", "G28 X", "M114")[0] == "echo: out"
+    assert abs(zero_error(stage, 80, 50)) < MICROSTEP_MM
 
 
 # ---------------------------------------------------------------------------------------------- calibrating
