@@ -52,7 +52,7 @@ def stage_of(folder: Path, kind: str, **options: Any) -> ProbeStage:
         ),
     ],
 )
-def test_turns_are_told_as_the_face_of_a_clock(
+def test_turns_are_reported_as_a_clock_face(
     tmp_path: Path, command: str, options: dict[str, Any], said: dict[str, str]
 ) -> None:
     stage = stage_of(tmp_path, "screws_tilt_adjust", **options)
@@ -96,7 +96,7 @@ def place(output: list[str]) -> str:
     return next(line for line in reversed(output) if line.startswith("X:")).partition(" E")[0]
 
 
-def test_the_nozzle_goes_from_screw_to_screw_until_all_fit(tmp_path: Path) -> None:
+def test_the_nozzle_goes_from_screw_to_screw_until_all_are_accepted(tmp_path: Path) -> None:
     options = {"probe_height": 0.2, "screw1_fine_adjust": "12, 22", "probe_speed": 4}
     stage = stage_of(tmp_path, "bed_screws", **options)
     steps = [
@@ -115,8 +115,8 @@ def test_the_nozzle_goes_from_screw_to_screw_until_all_fit(tmp_path: Path) -> No
     told = [line for line in output if line.startswith(("X:", "echo: "))]
     found = [(told[2 * n].partition(" E")[0], told[2 * n + 1][6:]) for n in range(len(steps))]
     assert found == [(at, state) for _, at, state in steps]
-    assert "all screws fit" in output
-    assert any(line.startswith("turn front left until it fits, then ACCEPT") for line in output)
+    assert "all bed screws are adjusted" in output
+    assert any(line.startswith("adjust front left; then ACCEPT") for line in output)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_the_nozzle_goes_from_screw_to_screw_until_all_fit(tmp_path: Path) -> No
     [
         (("BED_SCREWS_ADJUST",), "BED_SCREWS_ADJUST comes before X is homed; home with G28 first"),
         (("ADJUSTED",), "ADJUSTED is for BED_SCREWS_ADJUST; begin with that"),
-        (("G28", "BED_SCREWS_ADJUST", "BED_SCREWS_ADJUST"), "it goes on already"),
+        (("G28", "BED_SCREWS_ADJUST", "BED_SCREWS_ADJUST"), "already in progress"),
         (("G28", "BED_SCREWS_ADJUST", "MANUAL_PROBE"), "a height is looked for already"),
         (("SCREWS_TILT_CALCULATE",), "SCREWS_TILT_CALCULATE comes before Z is homed"),
     ],
@@ -138,12 +138,12 @@ def test_what_cannot_be_is_refused(tmp_path: Path, lines: tuple[str, ...], sente
     ("options", "sentence"),
     [
         ({"screw1": "10"}, "option 'screw1' of [bed_screws] must be X and Y in mm with a comma between them"),
-        ({"screw4_name": "d"}, "'screw4_name' of [bed_screws] is of a screw4 that is not there"),
+        ({"screw4_name": "d"}, "'screw4_name' of [bed_screws] refers to screw4, which is not configured"),
         ({"screws": "4"}, "[bed_screws] has no option 'screws'; remove it"),
         ({"screw_thread": "CW-M3"}, "[bed_screws] has no option 'screw_thread'; remove it"),
     ],
 )
-def test_mistakes_are_told_with_their_option(tmp_path: Path, options: dict[str, Any], sentence: str) -> None:
+def test_mistakes_name_their_option(tmp_path: Path, options: dict[str, Any], sentence: str) -> None:
     path = tmp_path / "machine.cfg"
     path.write_text(machine_text(sections=section("bed_screws", **{**SCREWS, **options})))
     with pytest.raises(ConfigError) as error:

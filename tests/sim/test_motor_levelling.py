@@ -160,7 +160,7 @@ def test_the_head_travels_as_fast_as_configured(tmp_path: Path) -> None:
     assert 1 / (80 * fastest_s) == pytest.approx(90 * np.cos(np.arctan2(80, 160)), rel=0.02)
 
 
-def test_the_head_travels_as_high_as_it_is_told(tmp_path: Path) -> None:
+def test_the_head_travels_at_the_height_of_the_command(tmp_path: Path) -> None:
     stage = make(tmp_path, "z_tilt", {"stepper_z1": 0.5})
     output = stage.do("G28", "G1 Z9 F600", "Z_TILT_ADJUST HORIZONTAL_MOVE_Z=6", "M114")
     # The last lift is to 6; then Z is corrected by the mean of the heights.
@@ -196,7 +196,7 @@ def test_too_large_a_correction_is_refused_before_it_is_made(tmp_path: Path) -> 
     counts_before: dict[str, int] = {}
     said = failure(stage, "G28", "G1 Z9 F600", "QUAD_GANTRY_LEVEL")
     assert re.search(
-        r"QUAD_GANTRY_LEVEL ends: a motor would have to move by 1\.\d+ mm, more than max_adjust", said
+        r"QUAD_GANTRY_LEVEL failed: a motor would have to move by 1\.\d+ mm, more than max_adjust", said
     )
     counts_before = {name: motor.count for name, motor in stage.page("mcu").motors.items() if "_z" in name}
     assert len(set(counts_before.values())) == 1, "the motors of Z moved together only"

@@ -202,7 +202,7 @@ gcode:
 # ---------------------------------------------------------------------------------------------- calibrating
 
 
-def test_accuracy_tells_the_spread_of_what_it_measured(tmp_path: Path) -> None:
+def test_accuracy_reports_the_spread_of_its_measurements(tmp_path: Path) -> None:
     output = measured(tmp_path, "PROBE_ACCURACY SAMPLES=6", noise_mm=0.03)
     found = heights(output)
     assert len(found) == 6

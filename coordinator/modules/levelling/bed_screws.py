@@ -1,6 +1,7 @@
-"""[bed_screws]: brings the nozzle above one screw after the other, which are turned by hand until all fit.
+"""[bed_screws]: brings the nozzle above one screw after the other, which are adjusted by hand.
 
-ACCEPT: this screw fits. ADJUSTED: it was turned a good deal, so all come again. ABORT ends it.
+ACCEPT: this screw needs no further change. ADJUSTED: it was changed significantly, so another round of all
+screws follows. ABORT ends it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,7 +44,7 @@ _OPTIONS: Final[tuple[Option[Any], ...]] = (TRAVEL_SPEED, HEIGHT, PROBE_HEIGHT, 
 class BedScrews(Module):
     """The section."""
 
-    SPEC = SectionSpec("Goes from screw to screw while they are turned by hand", _OPTIONS, family=SCREW)
+    SPEC = SectionSpec("Moves to each screw of the bed while it is adjusted by hand", _OPTIONS, family=SCREW)
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -55,8 +56,12 @@ class BedScrews(Module):
         self._at = self._accepted = 0
         build.shared(ManualProbe).other = self
         reads: tuple[tuple[str, str, Callable[[Call], Reading]], ...] = (
-            ("BED_SCREWS_ADJUST", "Go to one screw of the bed after the other", self._read_begin),
-            ("ADJUSTED", "A screw was turned a good deal: all come again", self._read_adjusted),
+            ("BED_SCREWS_ADJUST", "Move to each bed screw in turn, to adjust it by hand", self._read_begin),
+            (
+                "ADJUSTED",
+                "The current bed screw was changed significantly: repeat all screws",
+                self._read_adjusted,
+            ),
         )
         for name, text, read in reads:
             build.add_command(GCodeCommand(name, text, read))
@@ -83,7 +88,7 @@ class BedScrews(Module):
         if missing := next((letter for letter in "XYZ" if letter not in call.homed), ""):
             raise WordError(f"{call.command.name} comes before {missing} is homed; home with G28 first")
         if self.is_active:
-            raise WordError(f"{call.command.name}: it goes on already; ACCEPT, ADJUSTED or ABORT that")
+            raise WordError(f"{call.command.name}: already in progress; use ACCEPT, ADJUSTED or ABORT first")
         return Phases(lambda job: self._enter(job, "adjust"))
 
     def read_accept(self, call: Call) -> Reading:
@@ -104,7 +109,7 @@ class BedScrews(Module):
         def end(job: ProgramContext) -> Iterator[Reading]:
             self._round = ""
             yield from self._lift(job)
-            yield Immediate(("the search for turns of screws is ended",))
+            yield Immediate(("adjusting the bed screws was aborted",))
 
         return Phases(end)
 
@@ -122,7 +127,7 @@ class BedScrews(Module):
             return
         self._round = ""
         yield from self._lift(job)
-        yield Immediate(("all screws fit",))
+        yield Immediate(("all bed screws are adjusted",))
 
     def _next(self, job: ProgramContext, accepted: int) -> Iterator[Reading]:
         self._accepted = accepted
@@ -134,7 +139,7 @@ class BedScrews(Module):
         else:
             self._round = ""
             yield from self._lift(job)
-            yield Immediate(("all screws fit",))
+            yield Immediate(("all bed screws are adjusted",))
 
     def _go(self, job: ProgramContext) -> Iterator[Reading]:
         screw, (x, y) = self._places()[self._at]
@@ -143,7 +148,7 @@ class BedScrews(Module):
         yield ToProgram(lambda job: go(job, [x, y, self._height, e], self._speed))
         yield ToProgram(lambda job: go(job, [x, y, self._low, e], self._down_speed))
         yield Immediate(
-            (f"turn {screw.name} until it fits, then ACCEPT; ADJUSTED if it was a good deal, ABORT to end",)
+            (f"adjust {screw.name}; then ACCEPT, or ADJUSTED after a significant change, or ABORT",)
         )
 
     def _lift(self, job: ProgramContext) -> Iterator[Reading]:

@@ -148,12 +148,12 @@ class MotorLevelling(Module):
                 return
             if spread > before + self._increasing:
                 raise WordError(
-                    f"{command.name} ends: the heights are {spread:.4f} mm apart, more than {before:.4f} in"
+                    f"{command.name} failed: the heights are {spread:.4f} mm apart, more than {before:.4f} in"
                     " the pass before: check that the motors are in the order of their places"
                 )
             before = spread
         raise WordError(
-            f"{command.name} ends: the heights are {before:.4f} mm apart after {retries + 1} passes, more"
+            f"{command.name} failed: the heights are {before:.4f} mm apart after {retries + 1} passes, more"
             f" than retry_tolerance ({tolerance:g} mm)"
         )
 
@@ -169,7 +169,7 @@ class MotorLevelling(Module):
         adjusts, mean = adjustments(self.heights(measured))
         yield Immediate((self._report(number, spread, adjusts),))
         if why := self.check(adjusts):
-            raise WordError(f"{command.name} ends: {why}")
+            raise WordError(f"{command.name} failed: {why}")
         call = job.call(command)
         yield AtStandstill(lambda: self._adjust(call, adjusts, mean, speed))
         return spread

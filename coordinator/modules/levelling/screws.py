@@ -55,7 +55,7 @@ def _screw(build: Build, number: int, found: dict[str, RawOption]) -> Screw:
     if "" not in found:
         raw = next(iter(found.values()))
         raise ConfigError(
-            raw.place, f"'{raw.name}' of [{build.name}] is of a screw{number} that is not there"
+            raw.place, f"'{raw.name}' of [{build.name}] refers to screw{number}, which is not configured"
         )
     place = _place(build, found[""])
     name = found["_name"].value if "_name" in found else f"screw at {place[0]:.3f},{place[1]:.3f}"

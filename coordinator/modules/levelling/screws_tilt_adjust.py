@@ -94,7 +94,7 @@ class ScrewsTiltAdjust(Module):
         if limit is not None and worst_mm > limit:
             self._failed = True
             raise WordError(
-                f"{call.command.name} ends: a screw is {worst_mm:.3f} mm off, more than MAX_DEVIATION"
+                f"{call.command.name} failed: a screw is {worst_mm:.3f} mm off, more than MAX_DEVIATION"
                 f" ({limit:g} mm); turn the screws and start again"
             )
 

@@ -106,7 +106,7 @@ def test_a_mistake_names_the_line_of_the_command() -> None:
         replies(work, Wrong(), ())
 
 
-def test_a_command_that_calls_itself_is_told_so() -> None:
+def test_a_command_that_calls_itself_is_refused() -> None:
     class Again(Probing):
         def run(self, job: ProgramContext, call: Call) -> Iterator[Reading]:
             del job, call
