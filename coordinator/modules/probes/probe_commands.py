@@ -152,9 +152,8 @@ class ProbeCommands(Module):
         yield from self.probe.begin(job, call.command)
         found = yield from self.probe.measure(job, call.command, how)
         yield from self.probe.end(job, call.command)
-        if found is None:
-            return
-        x, y, trigger_z = found.nozzle
+        # A program that is only planned goes on as if the probe triggered at once.
+        x, y, trigger_z = job.planner.toolhead_position[:3] if found is None else found.nozzle
         yield from lift(job, job.planner.toolhead_position[2] + CALIBRATE_LIFT_MM, how.lift_speed)
         z, e = job.planner.toolhead_position[2:]
         there = [x + self.probe.offset[0], y + self.probe.offset[1], z, e]
