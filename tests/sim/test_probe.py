@@ -16,7 +16,7 @@ from tests.profiles import is_full
 from tests.stages.probe_stage import MICROSTEP_MM, OFFSET, ProbeStage, heights, machine_text
 
 TILTED = BedSettings(shape=Bed(z=0.2, x0=100, y0=100, tilt_x=0.002, tilt_y=-0.001, bow=0.3, radius=120))
-RUNS = 50 if is_full() else 8
+RUNS = 50 if is_full() else 6
 
 
 def zero_error(stage: ProbeStage, x: float = 0.0, y: float = 0.0) -> float:

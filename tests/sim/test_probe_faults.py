@@ -16,7 +16,7 @@ from nodes.virtual.plant_page import PlantFault
 from tests.profiles import is_full
 from tests.stages.probe_stage import OFFSET, ProbeStage, bed_height, machine_text
 
-SEEDS = 200 if is_full() else 10
+SEEDS = 200 if is_full() else 6
 LOWEST_MM = -0.5
 """position_min of Z."""
 SPEED = 8.0

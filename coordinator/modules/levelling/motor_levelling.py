@@ -4,12 +4,13 @@ A pass measures the places, moves the motors, and looks how far apart the height
 that is within the tolerance.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from coordinator.config.errors import ConfigError, NotSupported
-from coordinator.config.options import FloatOption, IntOption, Option
+from coordinator.config.options import BoolOption, FloatOption, IntOption, Option
 from coordinator.gcode.commands import (
     AtStandstill,
     Call,
@@ -52,10 +53,29 @@ INCREASING: Final = FloatOption(
     minimum=0,
     maximum=100,
 )
-OPTIONS: Final[tuple[Option[Any], ...]] = (*POINT_OPTIONS, RETRIES, RETRY_TOLERANCE, INCREASING)
+ADAPTIVE: Final = BoolOption(
+    name="adaptive_horizontal_move_z",
+    help="whether the head travels lower after the first pass: as high as the heights were apart, rounded up",
+    default=False,
+)
+LEAST_HEIGHT: Final = FloatOption(
+    name="min_horizontal_move_z",
+    help="lowest height of these ways; the probe must not touch the bed there",
+    default=1.0,
+    unit="mm",
+    minimum=0,
+    maximum=1000,
+)
+OPTIONS: Final[tuple[Option[Any], ...]] = (
+    *POINT_OPTIONS,
+    RETRIES,
+    RETRY_TOLERANCE,
+    INCREASING,
+    ADAPTIVE,
+    LEAST_HEIGHT,
+)
 UNSUPPORTED: Final = (
-    *("min_horizontal_move_z", "adaptive_horizontal_move_z", "enforce_lift_speed", "use_adjustments"),
-    *("alternate_probe_direction", "start_reverse"),
+    *("enforce_lift_speed", "use_adjustments", "alternate_probe_direction", "start_reverse"),
 )
 SMALL_MM: Final = 1e-4
 """Less than a step: nothing to move."""
@@ -82,6 +102,8 @@ class MotorLevelling(Module):
         self._points = ProbePoints(build, places)
         self._retries, self._tolerance = build.get(RETRIES), build.get(RETRY_TOLERANCE)
         self._increasing = build.get(INCREASING)
+        adaptive, least = build.get(ADAPTIVE), build.get(LEAST_HEIGHT)
+        self._least_height = least if adaptive else None
         self._probe: Probe | None = None
         self._live: ModuleContext | None = None
         self.applied = False
@@ -135,9 +157,10 @@ class MotorLevelling(Module):
         assert self._probe is not None
         retries, tolerance = until
         before = float("inf")
+        height = None
         self.applied = False
         for number in range(1, retries + 2):
-            found = yield from self._points.measure(job, command, self._probe, how)
+            found = yield from self._points.measure(job, command, self._probe, how, height)
             if found is None:
                 return
             spread = yield from self._level(
@@ -152,6 +175,8 @@ class MotorLevelling(Module):
                     " the pass before: check that the motors are in the order of their places"
                 )
             before = spread
+            if self._least_height is not None:
+                height = max(float(math.ceil(spread)), self._least_height)
         raise WordError(
             f"{command.name} failed: the heights are {before:.4f} mm apart after {retries + 1} passes, more"
             f" than retry_tolerance ({tolerance:g} mm)"

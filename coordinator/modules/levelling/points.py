@@ -92,10 +92,15 @@ class ProbePoints:
         )
 
     def measure(
-        self, job: ProgramContext, command: Command, probe: Probe, how: Measuring
+        self,
+        job: ProgramContext,
+        command: Command,
+        probe: Probe,
+        how: Measuring,
+        height: float | None = None,
     ) -> Generator[Reading, None, list[Measured] | None]:
-        """Measure all places in turn; None: it is only planned. The head ends at travel height."""
-        height = self.height(command)
+        """Measure all places in turn; None: it is only planned. The head ends at travel HEIGHT."""
+        height = self.height(command) if height is None else height
         found = []
         yield from probe.begin(job, command)
         for place in self.places:

@@ -64,7 +64,15 @@ class EndstopNotFoundError(HomingError):
         """How long that was."""
 
 
-class _LateError(HomingError):
+class MoveEndedError(HomingError):
+    """The move was ended before the endstop switched, for a reason that has nothing to do with it."""
+
+    def __init__(self, axes: str, why: str) -> None:
+        super().__init__(f"axis {axes} was not homed: {why}")
+        self.why = why
+
+
+class _LateError(MoveEndedError):
     """The nodes were not armed in time; all are stopped again."""
 
 
@@ -258,8 +266,7 @@ class HomingMove:
             await node.link.drained()
         if move.print_time_now() > move.begin_s:
             raise _LateError(
-                f"axis {_names(legs)} was not homed: arming its nodes took too long; check the bus for "
-                "errors and load"
+                _names(legs), "arming its nodes took too long; check the bus for errors and load"
             )
 
     def _arm_node(self, move: SingleMove, leg: _Leg, node: Node, sync: Trsync) -> None:
@@ -347,9 +354,10 @@ class HomingMove:
             if node.name not in states:
                 raise node.failure or HomingError(f"node {node.name} did not answer while an axis homed")
             if states[node.name].reason is TriggerReason.TIMEOUT:
-                raise HomingError(
-                    f"axis {leg.name} was not homed: node {node.name} did not hear from the host for "
-                    f"{leg.timeout_s:g} s and stopped by itself; check the bus for errors and load"
+                raise MoveEndedError(
+                    leg.name,
+                    f"node {node.name} did not hear from the host for {leg.timeout_s:g} s and stopped by"
+                    " itself; check the bus for errors and load",
                 )
         if not _switched(leg, states):
             raise EndstopNotFoundError(

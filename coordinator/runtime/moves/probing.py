@@ -18,6 +18,7 @@ from coordinator.runtime.moves.homing import (
     EndstopNotFoundError,
     HomingError,
     HomingMove,
+    MoveEndedError,
 )
 from nodes.support.errors import CanductorError
 
@@ -147,7 +148,7 @@ def in_words_of_the_probe(error: CanductorError) -> str:
             f"the probe did not trigger within {error.way_mm:.3f} mm: check that it is attached and deployed,"
             " and its wiring"
         )
-    return str(error)
+    return error.why if isinstance(error, MoveEndedError) else str(error)
 
 
 def check_over_bed(described: MachineDescription, probe: ProbeDescription, x: float, y: float) -> str:
