@@ -182,6 +182,31 @@ def test_safe_z_home_runs_the_lines_around_z_alone(tmp_path: Path) -> None:
     assert float(output[-1].split("Z:")[1].split()[0]) == pytest.approx(9, abs=MICROSTEP_MM)
 
 
+@pytest.mark.parametrize("activate", ["", "M118 out"])
+def test_axes_that_lean_keep_their_place_when_z_is_homed_elsewhere(tmp_path: Path, activate: str) -> None:
+    sections = "[safe_z_home]\nhome_xy_position: 100, 90\n[skew_correction]\n"
+    stage = ProbeStage(tmp_path, machine_text(sections=sections, activate_gcode=activate), bed=TILTED)
+    before = ("G28", "SET_SKEW XY=100.8,100,71", "G1 Z5 F600", "G1 X20 Y30 F6000")
+    lines = (*before, "G28 Z", "M114", "G1 Z5", "PROBE", "M114", "G1 Z5", "G1 X20 Y30")
+    places = [text for text in stage.do(*lines) if text.startswith("X:")]
+    assert places[0].split()[:2] == places[1].split()[:2]
+    skew = re.findall(r"[XY]:(\S+)", places[0])
+    steps = {name: motor.count / 80 for name, motor in stage.page("mcu").motors.items()}
+    # The motors went 80 mm along X and 60 mm along Y to where Z is homed, and Y adds to X.
+    factor = (float(skew[0]) - 100) / 60
+    assert abs(factor) > 0.005
+    assert (steps["stepper_x"], steps["stepper_y"]) == pytest.approx((20 - 30 * factor, 30), abs=0.03)
+
+
+def test_axes_with_tables_are_measured_too(tmp_path: Path) -> None:
+    stage = ProbeStage(tmp_path, machine_text(sections="[axis_tables]\n"), bed=TILTED)
+    output = stage.do("G28", "G1 X60 Y30 Z6 F900", "PROBE", "M114", "G1 Z5")
+    (found,) = heights(output)
+    assert found == pytest.approx(OFFSET[2] + stage.trigger_z(60, 30) - stage.trigger_z(0, 0), abs=0.005)
+    assert float(output[-1].split("Z:")[1].split()[0]) == pytest.approx(found, abs=0.01)
+    assert stage.true_mm("z") - stage.trigger_z(0, 0) == pytest.approx(5 - OFFSET[2], abs=0.005)
+
+
 def test_homing_override_homes_z_where_it_says(tmp_path: Path) -> None:
     override = """[homing_override]
 gcode:

@@ -186,9 +186,10 @@ class Skews(Module):
             if done is None or done.position is None:
                 return done
             before = self.now.wanted(call.position)
+            # An axis that is not homed may have been moved, as [safe_z_home] does for Z.
             believed = [
-                new if letter in done.homed else old
-                for letter, old, new in zip("XYZE", before, done.position, strict=True)
+                new if letter in done.homed else old + (new - at)
+                for letter, old, at, new in zip("XYZE", before, call.position, done.position, strict=True)
             ]
             x, y, z, _ = self.now.made((believed[0], believed[1], believed[2], 0.0))
             return replace(done, position=(x, y, z, done.position[3]))

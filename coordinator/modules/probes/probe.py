@@ -26,7 +26,6 @@ from coordinator.gcode.commands import (
     Call,
     Immediate,
     Lines,
-    Position,
     ProgramContext,
     Reading,
     ToProgram,
@@ -36,7 +35,7 @@ from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.homing.virtual_endstop import ProbeEndstop
-from coordinator.modules.levelling.skew_correction import Skews
+from coordinator.modules.levelling.skew_correction import Skew, Skews
 from coordinator.modules.probes.samples import AVERAGE, MEDIAN, SampleRules, SampleSeries
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, parameters
@@ -290,6 +289,7 @@ class Probe(ProbeEndstop):
                 call.position,
                 lowest_z=self._lowest_z,
                 speed=how.speed,
+                corrected=self._skews is not None and self._skews.now != Skew(),
                 say=self._live.say,
             )
             try:
@@ -298,7 +298,7 @@ class Probe(ProbeEndstop):
                 if self._live.machine.stopped is not None:
                     raise
                 raise CanductorError(f"{command.name} failed: {error}") from error
-            found.append(replace(contact, position=self._to_program(contact.position)))
+            found.append(contact)
             return Done(position=found[0].position, moved=True)
 
         yield AtStandstill(go_down)
@@ -307,10 +307,6 @@ class Probe(ProbeEndstop):
         if self._each:
             yield from self._run_lines(job, command, self._deactivate)
         return found[0]
-
-    def _to_program(self, believed: Position) -> Position:
-        """Return where the head is for programs when the motors stand at BELIEVED."""
-        return believed if self._skews is None else self._skews.now.made(believed)
 
     def _found(self, contact: Contact, height: float) -> Measured:
         x, y, _ = contact.trigger

@@ -60,7 +60,8 @@ def downwards(described: MachineDescription) -> Mapping[str, float] | None:
 class ProbingMove:
     """Lowers the head of MACHINE from POSITION (X Y Z E, by the program) until the probe triggers.
 
-    It goes no lower than LOWEST_Z (mm); SPEED in mm/s. SAY shows a sentence to the user.
+    It goes no lower than LOWEST_Z (mm); SPEED in mm/s. CORRECTED: the program's X Y Z are not those of the
+    motors, so that POSITION counts and not the motors' own. SAY shows a sentence to the user.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class ProbingMove:
         *,
         lowest_z: float,
         speed: float,
+        corrected: bool,
         say: Callable[[str], None],
     ) -> None:
         probe = machine.description.probe
@@ -78,6 +80,7 @@ class ProbingMove:
         assert ways is not None
         self._machine, self._probe, self._ways = machine, probe, ways
         self._position, self._lowest_z = position, lowest_z
+        self._corrected = corrected or machine.description.axis_tables is not None
         self._say = say
         limits = machine.description.limits
         self._speed = min(speed, limits.max_z_velocity)
@@ -85,7 +88,7 @@ class ProbingMove:
 
     async def run(self) -> Contact:
         """Move; raises CanductorError, with all stopped, saying which Z was reached."""
-        begin = await self._place()
+        begin = await self._place(self._position[:3])
         way_mm = begin[2] - self._lowest_z
         if way_mm < SHORTEST_MM:
             raise HomingError(
@@ -112,15 +115,14 @@ class ProbingMove:
                 raise
             reached = await self._reached() or f"{lowest_z:.3f} mm or higher"
             raise HomingError(f"{in_words_of_the_probe(error)}; Z is {reached}") from error
-        end = await self._place()
-        return Contact((*end, self._position[3]), begin[2] - result.way_to_trigger_mm)
+        x, y, z = await self._place((begin[0], begin[1], begin[2] - result.way_mm))
+        return Contact((x, y, z, self._position[3]), begin[2] - result.way_to_trigger_mm)
 
-    async def _place(self) -> Point:
-        """Return where the head is by the step counts; with axis tables, as the program has it."""
-        x, y, z, _ = self._position
-        if self._machine.description.axis_tables is not None:
-            return (x, y, z)
-        return await place_by_steps(self._machine) or (x, y, z)
+    async def _place(self, otherwise: Point) -> Point:
+        """Return where the head is by the step counts alone; OTHERWISE where they are not of the program."""
+        if self._corrected:
+            return otherwise
+        return await place_by_steps(self._machine) or otherwise
 
     async def _reached(self) -> str:
         try:
