@@ -22,8 +22,6 @@ from coordinator.runtime.moves.homing import (
 )
 from nodes.support.errors import CanductorError
 
-STRAIGHT_DOWN: Final = ("delta", "deltesian")
-"""Kinematics whose motors are no sums of axes, but go along with Z by as much."""
 SHORTEST_MM: Final = 1e-3
 """Of a way down: less is none."""
 
@@ -45,11 +43,11 @@ class Contact:
 
 def downwards(described: MachineDescription) -> Mapping[str, float] | None:
     """Return how far each motor goes per mm that the head is lowered; None: that depends on the place."""
-    straight = described.kinematics.name in STRAIGHT_DOWN
+    even = described.kinematics.even_along_z
     ways = {}
     for motor in described.motors:
         function = motor.function
-        if not function.linear and "z" in function.axes and not straight:
+        if not function.linear and "z" in function.axes and not even:
             return None
         way = motor.weights[2] if function.linear else float("z" in function.axes)
         if way:
