@@ -60,7 +60,6 @@ RETIRED = {
     "BusAddress": "BusOptions",
     "TalkBus": "BusTalk",
     "TableTalk": "NodeTables",
-    "by_nodeid": "nodeid",
     "end_of_calm": "start_of_queries",
     "release_on": "release",
 }

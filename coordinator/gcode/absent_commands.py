@@ -36,7 +36,7 @@ class AbsentCommand:
 
 
 _PROBES: Final = (
-    *("probe", "bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe", "dockable_probe"),
+    *("bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe", "dockable_probe"),
     *("cartographer", "beacon", "scanner"),
 )
 _WIDTH_SENSORS: Final = ("hall_filament_width_sensor", "tsl1401cl_filament_width_sensor")
@@ -52,10 +52,10 @@ _TABLE: Final[tuple[tuple[Effect, tuple[str, ...], str], ...]] = (
         "BED_MESH_CALIBRATE BED_MESH_PROFILE BED_MESH_OFFSET BED_MESH_CHECK",
     ),
     (Effect.NONE, ("bed_mesh",), "BED_MESH_CLEAR BED_MESH_MAP BED_MESH_OUTPUT"),
-    (Effect.LEVELS, ("z_tilt", "z_tilt_ng"), "Z_TILT_ADJUST Z_TILT_CALIBRATE Z_TILT_AUTODETECT"),
+    (Effect.LEVELS, ("z_tilt", "z_tilt_ng"), "Z_TILT_ADJUST"),
+    (Effect.LEVELS, ("z_tilt_ng",), "Z_TILT_CALIBRATE Z_TILT_AUTODETECT"),
     (Effect.LEVELS, ("quad_gantry_level",), "QUAD_GANTRY_LEVEL"),
     (Effect.LEVELS, ("bed_tilt",), "BED_TILT_CALIBRATE"),
-    (Effect.LEVELS, ("bed_screws",), "BED_SCREWS_ADJUST ADJUSTED"),
     (Effect.LEVELS, ("screws_tilt_adjust",), "SCREWS_TILT_CALCULATE"),
     (Effect.LEVELS, ("delta_calibrate",), "DELTA_CALIBRATE DELTA_ANALYZE"),
     (Effect.LEVELS, ("axis_twist_compensation",), "AXIS_TWIST_COMPENSATION_CALIBRATE"),
@@ -63,19 +63,24 @@ _TABLE: Final[tuple[tuple[Effect, tuple[str, ...], str], ...]] = (
     (Effect.LEVELS, ("z_thermal_adjust",), "SET_Z_THERMAL_ADJUST"),
     (
         Effect.LEVELS,
-        _PROBES,
-        (
-            "PROBE PROBE_ACCURACY PROBE_CALIBRATE Z_OFFSET_APPLY_PROBE PROBE_EDDY_CURRENT_CALIBRATE"
-            " PROBE_EDDY_CURRENT_TAP_CALIBRATE ATTACH_PROBE DETACH_PROBE SET_DOCKABLE_PROBE"
-            " MOVE_TO_APPROACH_PROBE MOVE_TO_DOCK_PROBE MOVE_TO_EXTRACT_PROBE MOVE_TO_INSERT_PROBE"
-            " MOVE_TO_DETACH_PROBE MOVE_AVOIDING_DOCK BLTOUCH_DEBUG BLTOUCH_STORE SET_SMART_EFFECTOR"
-            " RESET_SMART_EFFECTOR"
-        ),
+        ("probe", *_PROBES),
+        "PROBE PROBE_ACCURACY PROBE_CALIBRATE Z_OFFSET_APPLY_PROBE",
     ),
-    (Effect.NONE, _PROBES, "QUERY_PROBE QUERY_DOCKABLE_PROBE"),
     (
         Effect.LEVELS,
-        ("bed_mesh", "z_tilt", "z_tilt_ng", "quad_gantry_level", "bed_tilt", "delta_calibrate"),
+        _PROBES,
+        (
+            "PROBE_EDDY_CURRENT_CALIBRATE PROBE_EDDY_CURRENT_TAP_CALIBRATE ATTACH_PROBE DETACH_PROBE"
+            " SET_DOCKABLE_PROBE MOVE_TO_APPROACH_PROBE MOVE_TO_DOCK_PROBE MOVE_TO_EXTRACT_PROBE"
+            " MOVE_TO_INSERT_PROBE MOVE_TO_DETACH_PROBE MOVE_AVOIDING_DOCK BLTOUCH_DEBUG BLTOUCH_STORE"
+            " SET_SMART_EFFECTOR RESET_SMART_EFFECTOR"
+        ),
+    ),
+    (Effect.NONE, ("probe", *_PROBES), "QUERY_PROBE"),
+    (Effect.NONE, _PROBES, "QUERY_DOCKABLE_PROBE"),
+    (
+        Effect.LEVELS,
+        ("bed_mesh", "z_tilt_ng", "bed_tilt", "delta_calibrate"),
         "G29 G32 G33 G34",
     ),
     (Effect.MOVES, ("manual_stepper",), "MANUAL_STEPPER"),

@@ -76,6 +76,8 @@ class Kinematics(ABC):
     """As in the configuration."""
     second_carriages: ClassVar[Mapping[str, StepFunction]] = {}
     """By axis that may have a second carriage ([dual_carriage]): how that one's motor follows the axes."""
+    even_along_z: ClassVar[bool] = False
+    """Whether a rail that is no sum of axes, but that Z moves, goes as far as the head does along Z."""
 
     @property
     @abstractmethod

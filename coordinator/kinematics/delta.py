@@ -46,6 +46,7 @@ class Delta(Kinematics):
     print_radius: float | None = None
     """None: the radius, or less where a rod would lie too flat."""
     name = "delta"
+    even_along_z = True
     rails = ("a", "b", "c")
     homing_order = (("a", "b", "c"),)
 

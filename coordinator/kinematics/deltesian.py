@@ -37,6 +37,7 @@ class Deltesian(Kinematics):
     print_width: float | None = None
     """Of X, centred; None: as far as min_angle allows."""
     name = "deltesian"
+    even_along_z = True
     rails = ("left", "right", "y")
     homing_order = (("left", "right"), ("y",))
 

@@ -4,7 +4,7 @@ SET_STEPPER_ENABLE is for tests: it switches one driver, and those that share it
 """
 
 import asyncio
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Final
 
 from coordinator.config.pins import PinDescription
@@ -49,6 +49,8 @@ class MotorPower(Module):
                 line.steppers.append(stepper.name)
         self._lines = tuple(lines.values())
         self._motors = build.machine.motors
+        self.when_off: list[Callable[[Collection[str]], None]] = []
+        """Called with the names of motors that are switched off by a command."""
         for line in self._lines:
             build.add_device(line.node, line)
         for name in ("M84", "M18"):
@@ -122,5 +124,7 @@ class MotorPower(Module):
     async def _some(self, lines: "Iterable[EnableLine]", on: bool, done: Done) -> Done:
         for line in lines:
             self._switch(line, on=on)
+            for call in self.when_off if not on else ():
+                call(line.steppers)
         await asyncio.sleep(2 * WAKE_S)
         return done

@@ -5,7 +5,7 @@ are driven to x, y, z. Steppers follow the inverse: the correction changes the w
 """
 
 import math
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -16,6 +16,7 @@ from coordinator.gcode.commands import (
     AtStandstill,
     Call,
     Immediate,
+    Phases,
     Position,
     ProgramAction,
     ProgramContext,
@@ -150,11 +151,21 @@ class Skews(Module):
 
         def homing(call: Call, axes: str) -> Reading:
             reading = read(call, axes)
+            if isinstance(reading, Phases):
+                return Phases(lambda job: self._corrected_phases(reading, job, call.command))
             if isinstance(reading, AtStandstill):
                 return AtStandstill(self._corrected(reading.perform, call))
             return reading
 
         return homing
+
+    def _corrected_phases(self, phases: Phases, job: ProgramContext, command: Command) -> Iterator[Reading]:
+        for reading in phases.run(job):
+            if isinstance(reading, AtStandstill):
+                call = job.call(command)
+                yield AtStandstill(self._corrected(reading.perform, call), reading.planned)
+            else:
+                yield reading
 
     def _corrected(
         self, perform: Callable[[], Awaitable[Done | None]], call: Call
@@ -164,9 +175,10 @@ class Skews(Module):
             if done is None or done.position is None:
                 return done
             before = self.now.wanted(call.position)
+            # An axis that is not homed may have been moved, as [safe_z_home] does for Z.
             driven = [
-                new if letter in done.homed else old
-                for letter, old, new in zip("XYZE", before, done.position, strict=True)
+                new if letter in done.homed else old + (new - at)
+                for letter, old, at, new in zip("XYZE", before, call.position, done.position, strict=True)
             ]
             x, y, z, _ = self.now.made((driven[0], driven[1], driven[2], 0.0))
             return replace(done, position=(x, y, z, done.position[3]))

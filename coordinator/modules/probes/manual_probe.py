@@ -5,7 +5,7 @@ TESTZ also halves: between the height at hand and the next one that was tried ab
 
 from bisect import insort
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 from coordinator.gcode.builtins.state import go
 from coordinator.gcode.commands import AtStandstill, Call, ProgramAction, ProgramContext, Reading
@@ -22,6 +22,20 @@ SAME_MM: Final = 1e-6
 _BEGUN: Final = "now move with TESTZ Z=-0.1 (+, -, ++, --) until it fits; end with ACCEPT or ABORT"
 
 
+class TakesAnswers(Protocol):
+    """Another search that ACCEPT and ABORT answer while it is active."""
+
+    @property
+    def is_active(self) -> bool:
+        """Whether it waits for an answer."""
+
+    def read_accept(self, call: Call) -> Reading:
+        """Return what ACCEPT does."""
+
+    def read_abort(self, call: Call) -> Reading:
+        """Return what ABORT does."""
+
+
 class ManualProbe(Module):
     """The commands; one search at a time."""
 
@@ -31,8 +45,12 @@ class ManualProbe(Module):
         self._machine = build.machine
         self._accepted: Callable[[float], tuple[str, ...]] | None = None
         """What a height that is accepted leads to; None: nothing is looked for."""
+        self.other: TakesAnswers | None = None
+        """Another search, such as that for the turns of screws."""
         self._speed = SPEED
         self._tried: list[float] = []
+        self._z = 0.0
+        """Where the nozzle is while a height is looked for."""
         for name, text, read in (
             ("MANUAL_PROBE", "Begin to look for a height by hand; SPEED in mm/s", self._read_probe),
             ("Z_ENDSTOP_CALIBRATE", "Find position_endstop of stepper_z by hand", self._read_calibrate),
@@ -52,17 +70,24 @@ class ManualProbe(Module):
             build.add_command(name, text, read)
 
     def status(self) -> dict[str, Value]:
-        """Return whether a height is looked for."""
-        return {"is_active": self._accepted is not None}
+        """Return whether a height is looked for, and between which of those that were tried."""
+        active, z = self._accepted is not None, self._z
+        below, above = self._beside(z) if active else (None, None)
+        return {
+            "is_active": active,
+            "z_position": z if active else None,
+            "z_position_lower": below,
+            "z_position_upper": above,
+        }
 
     # ----------------------------------------------------------------------------------------------- begin
 
     def _read_probe(self, call: Call) -> Reading:
-        return self._begin(call, lambda z: (f"Z position is {z:.3f}",))
+        return self._begin_at_speed(call, lambda z: (f"Z position is {z:.3f}",))
 
     def _read_calibrate(self, call: Call) -> Reading:
         endstop = self._endstop(call)
-        return self._begin(call, lambda z: self._keep(endstop - z))
+        return self._begin_at_speed(call, lambda z: self._keep(endstop - z))
 
     def _read_apply(self, call: Call) -> Reading:
         call.parameters()
@@ -83,7 +108,7 @@ class ManualProbe(Module):
                     return found
         raise WordError(f"{call.command.name} needs a position_endstop of [stepper_z]; this machine has none")
 
-    def _begin(self, call: Call, accepted: Callable[[float], tuple[str, ...]]) -> Reading:
+    def _begin_at_speed(self, call: Call, accepted: Callable[[float], tuple[str, ...]]) -> Reading:
         values = call.parameters("SPEED")
         speed = number(call.command.name, values, "SPEED") if "SPEED" in values else SPEED
         if not 0 < speed <= self._machine.limits.max_z_velocity:
@@ -91,10 +116,23 @@ class ManualProbe(Module):
                 f"SPEED of {call.command.name} is {speed:g}; it must be above 0 and at most"
                 f" {self._machine.limits.max_z_velocity:g} mm/s"
             )
+        return self.begin(call, accepted, speed)
+
+    def check_free(self, call: Call) -> None:
+        """Raise WordError where no height can be looked for."""
         if "Z" not in call.homed:
             raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
-        if self._accepted is not None:
+        if self._accepted is not None or (self.other is not None and self.other.is_active):
             raise WordError(f"{call.command.name}: a height is looked for already; ACCEPT or ABORT that")
+
+    def begin(
+        self, call: Call, accepted: Callable[[float], tuple[str, ...]], speed: float = SPEED
+    ) -> Reading:
+        """Return what begins to look for a height, of which ACCEPTED makes replies.
+
+        TESTZ goes at SPEED, mm/s. Raises WordError.
+        """
+        self.check_free(call)
 
         def act(job: ProgramContext) -> bool:
             self._accepted, self._speed, self._tried = accepted, speed, []
@@ -145,7 +183,7 @@ class ManualProbe(Module):
         return (below[-1] if below else None), (above[0] if above else None)
 
     def _tell(self, job: ProgramContext) -> None:
-        z = job.planner.toolhead_position[2]
+        z = self._z = job.planner.toolhead_position[2]
         below, above = ("?" if tried is None else f"{tried:.3f}" for tried in self._beside(z))
         job.emit(Reply(job.line, f"Z position: {below} --> {z:.3f} <-- {above}"))
 
@@ -153,6 +191,8 @@ class ManualProbe(Module):
 
     def _read_accept(self, call: Call) -> Reading:
         call.parameters()
+        if self.other is not None and self.other.is_active:
+            return self.other.read_accept(call)
         accepted = self._check_active(call)
 
         async def accept() -> Done:
@@ -163,6 +203,8 @@ class ManualProbe(Module):
 
     def _read_abort(self, call: Call) -> Reading:
         call.parameters()
+        if self.other is not None and self.other.is_active:
+            return self.other.read_abort(call)
         self._check_active(call)
 
         async def abort() -> Done:

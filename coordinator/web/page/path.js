@@ -2,6 +2,7 @@
 
 const POINTS_MAX = 24_000;
 const ASK_MS = 500;
+const EXPECTED = new Set(["offline", "not_ready", "stopped"]); // there is no path at the moment
 
 export class Path {
   #link;
@@ -30,7 +31,7 @@ export class Path {
     try {
       while (this.#take(await this.#link.call("motion.path", { generation: this.#generation, first: this.count })));
     } catch (error) {
-      if (error.code !== "offline" && error.code !== "not_ready") console.warn(`path: ${error.message}`);
+      if (!EXPECTED.has(error.code)) console.warn(`path: ${error.message}`);
     } finally {
       this.#asking = false;
     }

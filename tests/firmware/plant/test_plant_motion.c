@@ -142,6 +142,35 @@ static void test_two_switches_on_one_pin(void) {
     free(rig);
 }
 
+// A bed 0.3 mm high, tilted along X and bowed; a frame that a step tilts by 0.0001 along X.
+static void test_a_bed_presses_the_probe(void) {
+    struct rig *rig =
+        new_rig("plant node=n\n"
+                "stepper name=both step=PA5 dir=PA6 both_edges=1\n"
+                "axis name=x origin=60\n"
+                "axis name=y origin=40\n"
+                "axis name=z origin=2.5\n"
+                "term axis=z node=- stepper=both mm=0.01\n"
+                "axis name=slope origin=0.001\n"
+                "term axis=slope node=- stepper=both mm=0.0001\n"
+                "bed name=bed z=0.3 x0=50 y0=50 tilt_x=0.01 bow=0.2 radius=100\n"
+                "probe name=p pin=PB0 bed=bed x=x y=y z=z slope_x=slope offset_x=10 offset_y=-20 "
+                "offset_z=1.5 hysteresis=0.03\n");
+    // At the probe, x = 70 and y = 20: the bed is at 0.3 + 0.2 + 0.2·(1 - 0.13) = 0.674, so that it is
+    // pressed at 2.174; the frame is at 2.57 + 0.017 a step there.
+    steps_both(rig, -23);
+    CHECK(!pressed(rig, SWITCH_PIN));
+    steps_both(rig, -1);
+    CHECK(pressed(rig, SWITCH_PIN));
+    steps_both(rig, 1); // 2.179 is within the hysteresis
+    CHECK(pressed(rig, SWITCH_PIN));
+    steps_both(rig, 2);
+    CHECK(!pressed(rig, SWITCH_PIN));
+    rig->page.items[rig->plant.first_switch].fault = PLANT_ALWAYS;
+    CHECK(pressed(rig, SWITCH_PIN));
+    free(rig);
+}
+
 static void test_noise_moves_the_switch_between_approaches(void) {
     struct rig *rig = new_rig("plant node=n seed=3\n"
                               "stepper name=both step=PA5 dir=PA6 both_edges=1\n"
@@ -260,6 +289,7 @@ int main(void) {
     test_drivers();
     test_a_switch_with_travel_and_stops();
     test_two_switches_on_one_pin();
+    test_a_bed_presses_the_probe();
     test_noise_moves_the_switch_between_approaches();
     test_an_axis_of_two_other_nodes();
     test_history_wraps();

@@ -381,7 +381,7 @@ ASKS = """
 mesh_min: 10, 20.5
 probe_count: 5
 faulty_region_1_min: 1, 2
-[quad_gantry_level]
+[z_tilt_ng]
 points:
     50, 25
     50, 225
@@ -398,10 +398,10 @@ gcode:
     {% set s = printer.configfile.settings %}
     {% set mesh = s.bed_mesh %}
     {action_respond_info("%s|%s|%s" % (mesh.mesh_min, mesh.probe_count, mesh.faulty_region_1_min))}
-    {action_respond_info("%s|%s" % (s.quad_gantry_level.points, s.stepper_x.step_pin))}
+    {action_respond_info("%s|%s" % (s.z_tilt_ng.points, s.stepper_x.step_pin))}
     {action_respond_info("%s|%s" % (s.stepper_x.gear_ratio, s.stepper_y.gear_ratio))}
     {action_respond_info("%s|%s" % (printer.bed_mesh.profiles, printer.bed_mesh.mesh_min))}
-    {action_respond_info("%s|%s" % (printer.quad_gantry_level.applied, printer["neopixel light"].color_data))}
+    {action_respond_info("%s|%s" % (printer.z_tilt_ng.applied, printer["neopixel light"].color_data))}
     {action_respond_info("%s|%s" % (printer.probe.last_query, printer["fan_generic mine"].speed))}
     {action_respond_info("[%s]" % printer.bed_mesh.nothing.of.that.kind|default("", true))}
     {action_call_remote_method("notify", text="x")}
