@@ -103,9 +103,11 @@ static unsigned axes_used(const struct step_stepper_config *config) {
 void step_choose_way(struct step_gen *gen, struct stepper *s) {
     step_forget(s);
     s->uses = axes_used(&s->config);
+    s->follows_bed = gen->surface.grid.points_x && s->uses & STEP_USES_Z;
+    s->uses |= s->follows_bed ? STEP_USES_X | STEP_USES_Y : 0;
     const bool smooth = s->smooth_s > 0 && s->uses & USES_E;
     s->reach = s->lag = smooth ? s->smooth_s / 2 : 0;
-    s->curve = smooth || s->config.formula;
+    s->curve = smooth || s->config.formula || s->follows_bed;
     for (int i = 0; i < gen->tap_count; i++)
         if (gen->taps[i].axes & s->uses) {
             s->reach = fmax(s->reach, -gen->taps[i].time);

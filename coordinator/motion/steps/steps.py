@@ -5,6 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps._steps import ffi, lib
 from nodes.support.c_structs import from_struct
@@ -100,6 +103,20 @@ def resting_step(spec: StepperSpec, start: Position, position: Position) -> int:
 def _mix(spec: StepperSpec, position: Position) -> float:
     x, y, z, e = (weight * axis for weight, axis in zip(spec.weights, position, strict=True))
     return x + y + z + e
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """The shape of a bed as step generation follows it (step_surface.h)."""
+
+    origin_mm: tuple[float, float]
+    """X and Y of the first node."""
+    spacing_mm: tuple[float, float]
+    """Between nodes along X and along Y, at least 0.1."""
+    nodes: NDArray[np.float64]
+    """Rows of X, 2 to 256 nodes both ways, of four each: height (mm), slopes by X and Y, twist (1/mm)."""
+    fade_mm: tuple[float, float, float]
+    """Planned Z up to which all acts, and from which only the third is added (infinite: all acts always)."""
 
 
 class StepGenerator:
@@ -270,6 +287,29 @@ class StepGenerator:
         offsets = [correction.offset_mm for correction in corrections]
         if lib.step_set_corrections(self._gen, offsets, [int(c.reverse) for c in corrections]):
             raise StepError(f"corrections cannot become {offsets} mm while moves wait; generate them first")
+
+    def set_surface(self, surface: "Surface | None") -> float:
+        """Let Z follow the shape of a bed from now on (None: a plane at 0): no steps.
+
+        Return the planned Z (mm) at which the axes stand from now on. Raises StepError unless the machine has
+        been at rest for the lag of all shapers and smoothing.
+        """
+        z = ffi.new("double *")
+        grid, nodes = ffi.new("struct step_surface *"), None
+        if surface is not None:
+            nodes = ffi.from_buffer("double[]", np.ascontiguousarray(surface.nodes))
+            grid.points_y, grid.points_x = surface.nodes.shape[:2]
+            grid.from_x, grid.from_y = surface.origin_mm
+            grid.step_x, grid.step_y = surface.spacing_mm
+            grid.fade_from, grid.fade_to, grid.fade_target = surface.fade_mm
+            grid.nodes = nodes
+        status = lib.step_set_surface(self._gen, grid, z)
+        if not status:
+            self._nodes_of_surface = nodes  # read by C from now on
+        self._check_settled(
+            status, "the shape of the bed", "a grid without 2 to 256 nodes, or steeper than 0.5,"
+        )
+        return float(z[0])
 
     @property
     def look_ahead_s(self) -> float:
