@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.motion.steps.steps import Surface
+from coordinator.motion.steps.surface import Surface
 from coordinator.verification.exact_signal import Floats
 
 # A cubic on 0..1 from its value and slope at 0, then at 1: rows are powers, columns these four.

@@ -298,7 +298,7 @@ int step_set_surface(struct step_gen *gen, const struct step_surface *grid, doub
     if (gen->surface.grid.points_x)
         step_surface_add(&gen->surface, at, still);
     step_surface_set(&gen->surface, grid);
-    gen->rest[AXIS_Z] = step_surface_planned_z(&gen->surface, at[AXIS_X], at[AXIS_Y], at[AXIS_Z]);
+    gen->rest[AXIS_Z] = step_surface_planned_z(&gen->surface.grid, at[AXIS_X], at[AXIS_Y], at[AXIS_Z]);
     start_afresh(gen);
     planned_position(gen, at);
     step_table_stand(&gen->tables[AXIS_Z], at[AXIS_Z], gen->tables[AXIS_Z].offset);

@@ -81,9 +81,15 @@ void step_surface_add(const struct surface *s, double *at, double *v) {
     v[AXIS_Z] += fade * (h.by_x * v[AXIS_X] + h.by_y * v[AXIS_Y]) + by_z * v[AXIS_Z] * over;
 }
 
+double step_surface_motor_z(const struct step_surface *g, double x, double y, double z) {
+    double by_z;
+    if (!g->points_x)
+        return z;
+    return z + g->fade_target + fade_at(g, z, &by_z) * (height_at(g, x, y).z - g->fade_target);
+}
+
 // What is added falls by at most STEEPEST per mm of Z, so the planned Z is unique; halving finds it.
-double step_surface_planned_z(const struct surface *s, double x, double y, double motor_z) {
-    const struct step_surface *g = &s->grid;
+double step_surface_planned_z(const struct step_surface *g, double x, double y, double motor_z) {
     if (!g->points_x)
         return motor_z;
     const double over = height_at(g, x, y).z - g->fade_target, most = fabs(over);
@@ -181,6 +187,12 @@ bool step_surface_is_legal(const struct step_surface *g) {
         }
     const double fading = g->fade_to - g->fade_from; // may be infinite, or NaN where both are
     return s.slope_x <= STEEPEST && s.slope_y <= STEEPEST && !(most > STEEPEST * fading);
+}
+
+double step_surface_steepest(const struct step_surface *g) {
+    struct surface s;
+    step_surface_set(&s, g);
+    return hypot(s.slope_x, s.slope_y);
 }
 
 // -------------------------------------------------------------------------------------------- for the spans

@@ -20,15 +20,10 @@ struct surface {
     double slope_x, slope_y, bend_xx, bend_xy, bend_yy;
 };
 
-bool step_surface_is_legal(const struct step_surface *grid);
-
 void step_surface_set(struct surface *surface, const struct step_surface *grid);
 
 // Moves AT from the planned place to the one that the motors go to, and V, its speeds, likewise.
 void step_surface_add(const struct surface *surface, double *at, double *v);
-
-// The planned Z from which the motors' Z is MOTOR_Z, at X and Y.
-double step_surface_planned_z(const struct surface *surface, double x, double y, double motor_z);
 
 // Whether heights inside X0..X1, Y0..Y1 and Z0..Z1 (planned) are smooth: inside the grid, and fade constant.
 bool step_surface_is_smooth(const struct surface *surface, double x0, double x1, double y0, double y1,

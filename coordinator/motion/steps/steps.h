@@ -21,6 +21,7 @@
 
 #include "coordinator/motion/trapezoid.h"
 
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
@@ -133,6 +134,16 @@ const struct step_formula *step_find_formula(const char *name);
 // Bytes that init needs, or 0 when CONFIG is not legal: counts within the limits above, node indices in
 // range, every length, frequency and error finite and > 0, ids in 32 bits, max_error at least one tick.
 size_t step_gen_size(const struct step_config *config);
+
+// Whether SURFACE can be a bed: counts and lengths in range, slopes and fading not steeper than 1/2.
+bool step_surface_is_legal(const struct step_surface *surface);
+
+// The slope that SURFACE has nowhere more of, mm/mm.
+double step_surface_steepest(const struct step_surface *surface);
+
+// Where Z has to be for the planned Z at X and Y, and the other way round.
+double step_surface_motor_z(const struct step_surface *surface, double x, double y, double z);
+double step_surface_planned_z(const struct step_surface *surface, double x, double y, double motor_z);
 
 // Prepares a generator in MEMORY of step_gen_size() bytes, aligned for a double. Node clocks begin as
 // ticks = print time · clock_freq.

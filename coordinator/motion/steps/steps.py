@@ -5,26 +5,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps._steps import ffi, lib
+from coordinator.motion.steps.errors import StepError
+from coordinator.motion.steps.surface import Surface
 from nodes.support.c_structs import from_struct
-from nodes.support.errors import CanductorError
 
 MAX_ERROR_S = 12.5e-6
 """How far a step may be from its true time by default."""
 TABLE_POINTS_MAX = int(lib.STEP_TABLE_POINTS)
 """Points of one axis table that step generation has room for."""
 Position = tuple[float, float, float, float]
-
-
-class StepError(CanductorError):
-    """Step generation cannot go on; the sentence says where and why."""
-
-    print_time_s: float | None = None
-    """Of the step or move that cannot be; None: it is no matter of time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,20 +94,6 @@ def resting_step(spec: StepperSpec, start: Position, position: Position) -> int:
 def _mix(spec: StepperSpec, position: Position) -> float:
     x, y, z, e = (weight * axis for weight, axis in zip(spec.weights, position, strict=True))
     return x + y + z + e
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Surface:
-    """The shape of a bed as step generation follows it (step_surface.h)."""
-
-    origin_mm: tuple[float, float]
-    """X and Y of the first node."""
-    spacing_mm: tuple[float, float]
-    """Between nodes along X and along Y, at least 0.1."""
-    nodes: NDArray[np.float64]
-    """Rows of X, 2 to 256 nodes both ways, of four each: height (mm), slopes by X and Y, twist (1/mm)."""
-    fade_mm: tuple[float, float, float]
-    """Planned Z up to which all acts, and from which only the third is added (infinite: all acts always)."""
 
 
 class StepGenerator:
@@ -288,27 +265,20 @@ class StepGenerator:
         if lib.step_set_corrections(self._gen, offsets, [int(c.reverse) for c in corrections]):
             raise StepError(f"corrections cannot become {offsets} mm while moves wait; generate them first")
 
-    def set_surface(self, surface: "Surface | None") -> float:
+    def set_surface(self, surface: Surface | None) -> float:
         """Let Z follow the shape of a bed from now on (None: a plane at 0): no steps.
 
         Return the planned Z (mm) at which the axes stand from now on. Raises StepError unless the machine has
         been at rest for the lag of all shapers and smoothing.
         """
         z = ffi.new("double *")
-        grid, nodes = ffi.new("struct step_surface *"), None
-        if surface is not None:
-            nodes = ffi.from_buffer("double[]", np.ascontiguousarray(surface.nodes))
-            grid.points_y, grid.points_x = surface.nodes.shape[:2]
-            grid.from_x, grid.from_y = surface.origin_mm
-            grid.step_x, grid.step_y = surface.spacing_mm
-            grid.fade_from, grid.fade_to, grid.fade_target = surface.fade_mm
-            grid.nodes = nodes
+        grid = ffi.new("struct step_surface *") if surface is None else surface.grid
         status = lib.step_set_surface(self._gen, grid, z)
-        if not status:
-            self._nodes_of_surface = nodes  # read by C from now on
-        self._check_settled(
-            status, "the shape of the bed", "a grid without 2 to 256 nodes, or steeper than 0.5,"
-        )
+        if status == lib.STEP_BAD_CONFIG:
+            both = next(s.name for s in self._steppers if s.weights[2] and s.weights[3])
+            raise StepError(f"the shape of the bed cannot be followed: {both} moves along both Z and E")
+        self._check_settled(status, "the shape of the bed", "")
+        self._surface = surface  # C reads its nodes
         return float(z[0])
 
     @property

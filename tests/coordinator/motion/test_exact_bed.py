@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from coordinator.motion.specs import StepperSpec
-from coordinator.motion.steps.steps import MAX_ERROR_S, StepError, StepGenerator, Surface
+from coordinator.motion.steps.errors import StepError
+from coordinator.motion.steps.steps import MAX_ERROR_S, StepGenerator
+from coordinator.motion.steps.surface import NO_FADE, Surface
 from coordinator.verification.exact_bed import ExactBed
 from coordinator.verification.exact_path import Setting, legs_of
 from tests.coordinator.motion.exact_cases import AWAY, PARAMS, SETTING, chain, spec_of, trapezoids
@@ -19,7 +21,6 @@ from tests.coordinator.motion.steps_oracle import make_move
 
 MOVES = 150
 CUT_S = 0.37
-NO_FADE = (math.inf, math.inf, 0.0)
 WITH_Z = [kind for kind in PARAMS if not kind.startswith("polar")]
 SETTINGS = {"plain": Setting(), "shaped": SETTING}
 
@@ -110,7 +111,7 @@ def test_every_step_over_a_bed(kind: str, setting: str) -> None:
 def test_long_moves_over_many_patches(seed: int) -> None:
     spec = replace(spec_of("z"), step_distance=0.0005)
     surface = bed(seed, spacing_mm=7.0)
-    fine = replace(surface, spacing_mm=(7.0 / 3, 5.6 / 3), nodes=np.tile(surface.nodes / 3, (3, 3, 1)))
+    fine = Surface(surface.origin_mm, (7.0 / 3, 5.6 / 3), np.tile(surface.nodes / 3, (3, 3, 1)))
     assert judge(spec, across(seed), Setting(), fine) > 5000
 
 
@@ -150,12 +151,13 @@ def test_taking_up_and_clearing_a_surface_moves_nothing() -> None:
     ],
 )
 def test_what_is_no_bed_is_refused(change: str, value: Any) -> None:
-    gen = StepGenerator([spec_of("z")], [node_spec()])
-    with pytest.raises(StepError, match="shape of the bed"):
-        gen.set_surface(replace(bed(1), **{change: value}))
+    good = bed(1)
+    values = {name: getattr(good, name) for name in ("origin_mm", "spacing_mm", "nodes", "fade_mm")}
+    with pytest.raises(StepError, match="shape of the bed is refused"):
+        Surface(**(values | {change: value}))
 
 
 def test_z_and_e_of_one_stepper_are_refused() -> None:
     gen = StepGenerator([stepper(0, (0.0, 0.0, 1.0, 0.5), 0.01)], [node_spec()])
-    with pytest.raises(StepError, match="shape of the bed"):
+    with pytest.raises(StepError, match="both Z and E"):
         gen.set_surface(bed(1))
