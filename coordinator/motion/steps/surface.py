@@ -36,13 +36,14 @@ class Surface:
         self.nodes = np.ascontiguousarray(nodes, dtype=np.float64)
         self.fade_mm = fade_mm
         self._memory = ffi.from_buffer("double[]", self.nodes)
-        self.grid: Any = ffi.new("struct step_surface *")
+        grid: Any = ffi.new("struct step_surface *")
+        grid.points_y, grid.points_x = self.nodes.shape[:2]
+        grid.from_x, grid.from_y = origin_mm
+        grid.step_x, grid.step_y = spacing_mm
+        grid.fade_from, grid.fade_to, grid.fade_target = fade_mm
+        grid.nodes = self._memory
+        self.grid = grid
         """The same for C."""
-        self.grid.points_y, self.grid.points_x = self.nodes.shape[:2]
-        self.grid.from_x, self.grid.from_y = origin_mm
-        self.grid.step_x, self.grid.step_y = spacing_mm
-        self.grid.fade_from, self.grid.fade_to, self.grid.fade_target = fade_mm
-        self.grid.nodes = self._memory
         if not lib.step_surface_is_legal(self.grid):
             raise StepError(
                 f"the shape of the bed is refused: it has to be a grid of 2 to {NODES_MAX} points both ways,"
