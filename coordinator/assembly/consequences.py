@@ -15,7 +15,7 @@ _NO_MEASURING: Final = "nothing is measured; lines that move for it end a job"
 _KINDS: Final[Mapping[str, str]] = {
     **dict.fromkeys(
         (
-            *("probe", "bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe"),
+            *("bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe"),
             *("dockable_probe", "z_calibration", "tools_calibrate"),
         ),
         _NO_PROBE,

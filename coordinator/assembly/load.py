@@ -22,6 +22,7 @@ from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.sections.kinematics.registry import KINDS, read_frame
 from coordinator.config.sections.nodes import check_policies, make_pin_registry, read_nodes
 from coordinator.config.sections.printer import open_printer, read_printer
+from coordinator.config.sections.probe import read_probe
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.second_endstops import with_second_endstops
 from coordinator.config.sections.shaper import read_shapers
@@ -78,6 +79,7 @@ def describe(config: ConfigFile) -> MachineDescription:
     followers = read_extruder_steppers(reading, extruders)
     shapers = read_shapers(reading)
     axis_tables = read_axis_tables(reading)
+    probe = read_probe(reading, frame)
     description = MachineDescription(
         path=config.path,
         nodes=nodes,
@@ -94,6 +96,7 @@ def describe(config: ConfigFile) -> MachineDescription:
         unsupported=(),
         notes=(),
         axis_tables=axis_tables,
+        probe=probe,
         source=ConfigSource(config.path, config.data, saved_values(config)),
     )
     unsupported += [

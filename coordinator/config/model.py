@@ -122,12 +122,19 @@ class HomingDescription:
     """Why G28 must not move it, whatever its endstop; empty: it may."""
 
     @property
+    def by_probe(self) -> bool:
+        """Whether its endstop is the probe, which acts."""
+        return self.endstop_pin is not None and self.virtual_endstop == PROBE_ENDSTOP
+
+    @property
     def waits(self) -> bool:
         """Whether its endstop is one that no module offers yet."""
         return self.endstop_pin is None and bool(self.virtual_endstop)
 
 
 NO_ENDSTOP = HomingDescription()
+PROBE_ENDSTOP = "probe:z_virtual_endstop"
+"""The virtual endstop of Z that is the probe."""
 
 
 SECOND_CARRIAGE = "dual_carriage"
@@ -170,6 +177,16 @@ class RailDescription:
             if stepper.name in own
         )
         return (first, *others) if own else (self,)
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeDescription:
+    """The probe, and what stops when it triggers."""
+
+    rail: RailDescription
+    """Whose endstop it is: Z, or else one of its own with the name ``probe``."""
+    offset: Point
+    """From the nozzle: X, Y, and how high that is above the bed when it triggers, mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,6 +316,7 @@ class MachineDescription:
     """Sentences about what has no effect."""
     axis_tables: AxisTablesDescription | None = None
     """None: axes have no tables."""
+    probe: ProbeDescription | None = None
     source: ConfigSource | None = None
     """The file, for what is saved into it; None: there is none."""
 
@@ -311,10 +329,12 @@ class MachineDescription:
 
     @property
     def stops(self) -> tuple[RailDescription, ...]:
-        """All that has an endstop of its own on a pin: rails, pieces of rails, the second carriage."""
+        """All that has an endstop of its own on a pin: rails, pieces of rails, second carriage, probe."""
         second = self.second_carriage
         pieces = (piece for rail in self.rails for piece in rail.pieces)
-        found = (*pieces, *(() if second is None else (second,)))
+        found = [*pieces, *(() if second is None else (second,))]
+        if self.probe is not None and self.probe.rail.axis not in (rail.axis for rail in self.rails):
+            found.append(self.probe.rail)
         return tuple(rail for rail in found if rail.homing.endstop_pin is not None)
 
     @property

@@ -56,6 +56,15 @@ class PinDescription:
         return number
 
 
+@dataclass(frozen=True, slots=True)
+class ProbeSwitch:
+    """What an endstop_pin means that names the probe."""
+
+    pin: PinName
+    offset: tuple[float, float, float]
+    """Of the probe from the nozzle, mm."""
+
+
 NO_PIN = PinName(PRIMARY_NODE, "")
 """Stands in for a pin after a mistake."""
 
@@ -119,6 +128,8 @@ class PinRegistry:
     the colon: ``sx1509_duex`` is of ``sx1509 duex``."""
     multi_pins: set[str] = field(default_factory=set)
     """Names of the sections [multi_pin NAME], whose pins are all behind ``multi_pin:``."""
+    probe: ProbeSwitch | None = None
+    """The input of [probe], which ``probe:z_virtual_endstop`` stands for."""
 
     def copy(self) -> "PinRegistry":
         """Return one that goes on from here by itself."""
@@ -130,6 +141,7 @@ class PinRegistry:
             dict(self.diag_pins),
             self.chips,
             self.multi_pins,
+            self.probe,
         )
 
     def add_alias(self, node: str, alias: str, name: str, option: RawOption) -> None:

@@ -36,7 +36,7 @@ class AbsentCommand:
 
 
 _PROBES: Final = (
-    *("probe", "bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe", "dockable_probe"),
+    *("bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe", "dockable_probe"),
     *("cartographer", "beacon", "scanner"),
 )
 _WIDTH_SENSORS: Final = ("hall_filament_width_sensor", "tsl1401cl_filament_width_sensor")

@@ -10,11 +10,12 @@ ToProgram     acts on the program that reads it: on its modes, on where its move
 AtStandstill  is done at standstill, and the program waits for it: a heater to become hot, homing
 Lines         is replaced by other lines: a macro
 BuiltIn       is what the interpreter makes of another name: a command whose name a macro has taken
+Phases        are several of these, one after the other, of which each may depend on what came of those before
 ============  ===============================================================================================
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -106,7 +107,18 @@ class BuiltIn:
     name: str
 
 
-Reading = Immediate | Synchronized | AtStandstill | Lines | ToProgram | BuiltIn
+@dataclass(frozen=True, slots=True)
+class Phases:
+    """Follow the readings that RUN yields for the program; the next is made when the one before is over.
+
+    RUN goes on in the reader's thread and may raise WordError. Where a program is only planned, what is done
+    at standstill never happens: RUN has to end when it finds that nothing came of it.
+    """
+
+    run: "Callable[[ProgramContext], Iterator[Reading]]"
+
+
+Reading = Immediate | Synchronized | AtStandstill | Lines | ToProgram | BuiltIn | Phases
 
 
 @dataclass(frozen=True, slots=True)

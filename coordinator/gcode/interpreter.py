@@ -5,7 +5,7 @@ real-time streamer drive the same ``step`` and act on its events (events.py).
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,6 +19,7 @@ from coordinator.gcode.commands import (
     Call,
     Immediate,
     Lines,
+    Phases,
     PrintControl,
     ProgramContext,
     Reading,
@@ -91,6 +92,24 @@ class _Inner:
         return len(self.data) if end < 0 else end
 
 
+@dataclass(slots=True)
+class _Phase:
+    """Readings that take a command's place, one after the other."""
+
+    command: Command
+    readings: Iterator[Reading]
+    waiting: Reading | None = None
+    """Which could not be followed yet: the planner was full."""
+
+    @property
+    def name(self) -> str:
+        return self.command.name
+
+    @property
+    def place(self) -> str:
+        return ""  # it has no lines of its own
+
+
 class Job(ProgramContext):
     """One run of PROGRAM through PLANNER.
 
@@ -128,7 +147,7 @@ class Job(ProgramContext):
         self.recorded: dict[str, Recorded] = {}
         """By command name."""
         self._events: deque[Event] = deque()
-        self._inner: list[_Inner] = []
+        self._inner: list[_Inner | _Phase] = []
         self._resting: StandstillAction | None = None
         self._over: Event | GCodeError | None = None
         self._told: set[str] = set()
@@ -248,11 +267,12 @@ class Job(ProgramContext):
         if not self._inner:  # else its line is done when they are
             self.planner.line_done()
 
-    def _advance_inner(self, inner: _Inner) -> None:
+    def _advance_inner(self, inner: _Inner | _Phase) -> None:
+        if isinstance(inner, _Phase):
+            self._advance_phase(inner)
+            return
         if inner.start >= len(inner.data):
-            self._inner.pop()
-            if not self._inner:
-                self.planner.line_done()
+            self._inner_done()
             return
         inner.at = inner.start
         end = inner.line_end()
@@ -267,6 +287,24 @@ class Job(ProgramContext):
             self._refused(feed)
             return
         inner.start = end + 1
+
+    def _advance_phase(self, phase: _Phase) -> None:
+        try:
+            reading = phase.waiting or next(phase.readings, None)
+            if reading is None:
+                self._inner_done()
+            elif not self.follow(phase.command, reading):
+                phase.waiting = reading
+                self._events.append(Full())
+            else:
+                phase.waiting = None
+        except (WordError, ValueError) as problem:
+            raise self._error(str(problem)) from None
+
+    def _inner_done(self) -> None:
+        self._inner.pop()
+        if not self._inner:
+            self.planner.line_done()
 
     def _do(self, line: bytes, hint: str = "") -> bool:
         """Carry out a line that is no move; False: the planner has to be emptied first."""
@@ -357,11 +395,13 @@ class Job(ProgramContext):
                 self._resting = StandstillAction(self.line, end_s, reading.perform, reading.planned)
                 self._events.append(self._resting)
             case Lines():
-                if len(self._inner) >= MAX_DEPTH:
-                    raise WordError(self._too_deep(command.name))
+                self._check_depth(command)
                 self._reply(reading.replies)
                 data = reading.text.encode(errors="replace")
                 self._inner.append(_Inner(command.name, data, where=reading.where))
+            case Phases():
+                self._check_depth(command)
+                self._inner.append(_Phase(command, reading.run(self)))
             case ToProgram():
                 return reading.act(self)
             case BuiltIn():
@@ -396,6 +436,10 @@ class Job(ProgramContext):
 
     # ---- For the handlers ----
 
+    def _check_depth(self, command: Command) -> None:
+        if len(self._inner) >= MAX_DEPTH:
+            raise WordError(self._too_deep(command.name))
+
     def _too_deep(self, name: str) -> str:
         """Say how NAME comes to stand in too many others."""
         callers = [inner.name for inner in self._inner]
@@ -406,7 +450,7 @@ class Job(ProgramContext):
         return f"{name} calls itself{by_way_of}, {MAX_DEPTH} levels deep; end that"
 
     def _error(self, problem: str, line: int | None = None) -> GCodeError:
-        places = [inner.place for inner in self._inner]
+        places = [inner.place for inner in self._inner if inner.place]
         if len(places) > MAX_PLACES:
             places = [places[0], "…", places[-1]] if places[0] != places[-1] else places[:1]
         within = "".join(f"{place}: " for place in places)

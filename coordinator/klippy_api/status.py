@@ -153,10 +153,6 @@ class StatusBuilder:
                     objects[name] = {**objects[name], "temperature": 0.0}
         else:
             objects["heaters"] = {f"available_{kind}": [] for kind in ("heaters", "sensors", "monitors")}
-        probe = objects.get("manual_probe")
-        if probe is not None:
-            heights = dict.fromkeys(("z_position", "z_position_lower", "z_position_upper"))
-            objects["manual_probe"] = {**heights, **probe}
 
 
 def _heaters(heaters: HeaterRegistry) -> dict[str, Any]:

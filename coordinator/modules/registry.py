@@ -22,6 +22,7 @@ from coordinator.modules.motion.firmware_retraction import FirmwareRetraction
 from coordinator.modules.motion.force_move import ForceMove
 from coordinator.modules.motion.gcode_arcs import GCodeArcs
 from coordinator.modules.outputs.output_pin import OutputPin, StaticDigitalOutput
+from coordinator.modules.probes.switch_probe import SwitchProbe
 from coordinator.modules.programs.delayed_gcode import DelayedGCode
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
@@ -60,6 +61,7 @@ MODULES: Final[dict[str, type[Module]]] = {
     "output_pin": OutputPin,
     "pause_resume": PauseResume,
     "pid_profile": PidProfile,
+    "probe": SwitchProbe,
     "respond": Respond,
     "safe_z_home": SafeZHome,
     "save_variables": SaveVariables,

@@ -12,6 +12,7 @@ import numpy as np
 
 from coordinator.config.model import SECOND_CARRIAGE, MachineDescription, RailDescription, StepperDescription
 from coordinator.kinematics.base import Point
+from coordinator.virtual_machine.plant_bed import BedSettings, ProbeParts, probe_parts
 from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
 from coordinator.virtual_machine.plant_tmc import machine_drivers
 from nodes.support.errors import CanductorError
@@ -45,6 +46,8 @@ class PlantSettings:
     """Initial offset from the head of a side of an axis that has its own endstop, by its first motor."""
     switch_noise_mm: float = 0.0
     """Largest deviation of an endstop's switching position from one approach to the next."""
+    bed: BedSettings = field(default_factory=BedSettings)
+    """What the probe finds, and how exactly."""
     heat: HeatSettings = field(default_factory=HeatSettings)
 
 
@@ -63,7 +66,10 @@ def machine_plants(
         for rail in _rails(description)
         if rail.homing.endstop_pin is not None
     ]
+    probe = _probe(description, start, settings)
     plants = [_mechanics(description, node.name, endstops, settings) for node in description.nodes]
+    if probe is not None:
+        plants = [_with_probe(plant, probe) for plant in plants]
     heat = machine_heat(description, settings.heat)
     drivers = machine_drivers(description)
     return {
@@ -118,6 +124,23 @@ def _mechanics(
     )
 
 
+def _probe(description: MachineDescription, start: Point, settings: PlantSettings) -> ProbeParts | None:
+    """Return the probe with its axes; None: there is none, or X and Y are no sums of motors."""
+    if description.probe is None:
+        return None
+    terms = [_axis_terms(description, replace(description.rails[0], axis=letter)) for letter in AXES]
+    if not all(terms):
+        return None
+    axes = [Axis(name=f"probe_{a}", terms=t, origin=o) for a, t, o in zip(AXES, terms, start, strict=True)]
+    return probe_parts(description, axes, settings.bed)
+
+
+def _with_probe(plant: NodePlant, parts: ProbeParts) -> NodePlant:
+    if parts.node != plant.node:
+        return plant
+    return replace(plant, axes=(*plant.axes, *parts.axes), beds=(parts.bed,), probes=(parts.probe,))
+
+
 def _stepper(stepper: StepperDescription, settings: PlantSettings) -> Stepper:
     enable = stepper.enable_pin if settings.enable_pins else None
     if enable is not None and enable.node != stepper.node:
@@ -157,10 +180,12 @@ def _endstop(
     assert at is not None
     direction = 1 if rail.homing.positive_dir else -1
     unit = RAD_PER_MM if rail.steppers[0].function.turns else 1.0
+    low, high = _stops(rail, at, BEYOND_MM * unit) if settings.stops else (-np.inf, np.inf)
+    if rail.homing.by_probe:
+        return pin.node, None, Axis(name=name, terms=terms, origin=origin, min=low, max=high)
     if rail.homing.virtual_endstop:
         low, high = _stops(rail, at, 0.0)
         return pin.node, None, Axis(name=name, terms=terms, origin=origin, min=low, max=high)
-    low, high = _stops(rail, at, BEYOND_MM * unit) if settings.stops else (-np.inf, np.inf)
     switch = Switch(
         name=name,
         pin=pin.name,

@@ -23,6 +23,7 @@ enum {
     PLANT_AXES = 16,
     PLANT_TERMS = 8,
     PLANT_SWITCHES = 16,
+    PLANT_BEDS = 4,
     PLANT_TMCS = 16,
     PLANT_TMC_EDGES = 96, // more than a datagram has
     PLANT_DIAGS = 16,
@@ -72,12 +73,25 @@ struct plant_axis {
     int term_count;
 };
 
+// The height of a bed at x, y: z + tilt_x·(x - x0) + tilt_y·(y - y0)
+// + bow·(1 - ((x - x0)² + (y - y0)²) / radius²), so that a bowed bed is highest, or lowest, at x0, y0.
+struct plant_bed {
+    char name[PLANT_NAME];
+    double z, x0, y0, tilt_x, tilt_y, bow, radius;
+};
+
 // Pressed (high, or low when inverted) from AT on in DIRECTION (1 or -1). It is released HYSTERESIS before
 // that again, and each approach finds it up to NOISE beside AT.
+// A probe is a switch that the bed presses: it is at OFFSET_X, OFFSET_Y from the nozzle, and pressed when the
+// nozzle is OFFSET_Z above the bed there, or lower. The height of the nozzle is that of AXIS; with slopes
+// (mm per mm, axes as well; -1: none) that height is of x = y = 0 and grows along x and y.
 struct plant_switch {
     char name[PLANT_NAME];
     int pin, axis, direction, inverted;
     double at, hysteresis, noise;
+    int bed; // of a probe; -1: it is an endstop
+    int x_axis, y_axis, slope_x_axis, slope_y_axis;
+    double offset_x, offset_y, offset_z;
     int pressed;
     double shift; // of this approach
     uint64_t switched;
@@ -195,12 +209,13 @@ struct plant {
     // Whether its level matters, whether more than that happens when it changes, whether the plant drives it.
     uint8_t cares[PLANT_PINS], writes[PLANT_PINS], reads[PLANT_PINS];
     int peer_count, stepper_count, axis_count, switch_count, body_count, couple_count, cooling_count;
-    int heater_count, fan_count, sensor_count, zone_count, tmc_count, diag_count;
+    int heater_count, fan_count, sensor_count, zone_count, tmc_count, diag_count, bed_count;
     int first_heater, first_fan, first_sensor, first_switch, first_tmc; // their first items in the page
     struct plant_peer peers[PLANT_PEERS];
     struct plant_stepper steppers[PLANT_STEPPERS];
     struct plant_axis axes[PLANT_AXES];
     struct plant_switch switches[PLANT_SWITCHES];
+    struct plant_bed beds[PLANT_BEDS];
     struct plant_tmc tmcs[PLANT_TMCS];
     struct plant_diag diags[PLANT_DIAGS];
     struct plant_body bodies[PLANT_BODIES];

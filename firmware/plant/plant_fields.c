@@ -66,6 +66,13 @@ static int find_axis(const struct plant *plant, const char *name) {
     return -1;
 }
 
+static int find_bed(const struct plant *plant, const char *name) {
+    for (int i = 0; i < plant->bed_count; i++)
+        if (strcmp(plant->beds[i].name, name) == 0)
+            return i;
+    return -1;
+}
+
 int plant_text_body(const struct plant *plant, const char *name) {
     for (int i = 0; i < plant->body_count; i++)
         if (strcmp(plant->bodies[i].name, name) == 0)
@@ -116,6 +123,8 @@ static int read_value(const struct plant *plant, const struct plant_field *field
         return read_word((int *)out, text, curves, 5);
     case AXIS:
         return (*(int *)out = find_axis(plant, text)) < 0 ? -1 : 0;
+    case BED:
+        return (*(int *)out = find_bed(plant, text)) < 0 ? -1 : 0;
     case BODY:
         return (*(int *)out = plant_text_body(plant, text)) < 0 ? -1 : 0;
     case STEPPER:
@@ -133,6 +142,7 @@ static void describe(const struct plant_field *field, char *out) {
                                         [SIGN] = "1 or -1",
                                         [CURVE] = "beta, steinhart, rtd, linear or table",
                                         [AXIS] = "an axis described above",
+                                        [BED] = "a bed described above",
                                         [BODY] = "a body described above",
                                         [STEPPER] = "a stepper described above",
                                         [CHIP] = "tmc2208 or tmc2209"};

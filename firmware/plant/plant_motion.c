@@ -103,16 +103,43 @@ static void set_pressed(struct plant *plant, struct plant_switch *it, int presse
     plant_note(plant, ns, "switch", it->name, pressed);
 }
 
+static double bed_height(const struct plant_bed *bed, double x, double y) {
+    double dx = x - bed->x0;
+    double dy = y - bed->y0;
+    double far = (dx * dx + dy * dy) / (bed->radius * bed->radius);
+    return bed->z + bed->tilt_x * dx + bed->tilt_y * dy + bed->bow * (1 - far);
+}
+
+// The place of an axis whose steps are all in at NS; 0 where there is none.
+static double settled_position(struct plant *plant, int axis, uint64_t ns) {
+    if (axis < 0)
+        return 0;
+    settle(plant, &plant->axes[axis], ns);
+    return plant_axis_position(plant, &plant->axes[axis], ns);
+}
+
+// How far the bed has pushed a probe in.
+static double probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns) {
+    double x = settled_position(plant, it->x_axis, ns) + it->offset_x;
+    double y = settled_position(plant, it->y_axis, ns) + it->offset_y;
+    double z = settled_position(plant, it->axis, ns) + x * settled_position(plant, it->slope_x_axis, ns) +
+               y * settled_position(plant, it->slope_y_axis, ns);
+    return bed_height(&plant->beds[it->bed], x, y) + it->offset_z - z;
+}
+
+static double switch_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns) {
+    if (it->bed >= 0)
+        return probe_depth(plant, it, ns);
+    return it->direction * (settled_position(plant, it->axis, ns) - it->at);
+}
+
 static int is_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns) {
     struct plant_page_item *item = &plant->page->items[plant->first_switch + (int)(it - plant->switches)];
     uint32_t fault = atomic_load_explicit(&item->fault, memory_order_relaxed);
     if (fault == PLANT_NEVER || fault == PLANT_ALWAYS)
         return fault == PLANT_ALWAYS;
-    struct plant_axis *axis = &plant->axes[it->axis];
-    settle(plant, axis, ns);
-    double beyond = it->direction * (plant_axis_position(plant, axis, ns) - it->at) - it->shift;
     double needed = it->pressed ? -it->hysteresis : 0.0;
-    return beyond >= needed - ROUNDING;
+    return switch_depth(plant, it, ns) - it->shift >= needed - ROUNDING;
 }
 
 int plant_switch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns) {

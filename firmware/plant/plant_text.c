@@ -119,7 +119,57 @@ static int read_switch(const struct plant_reader *reader, char *rest) {
     struct plant *plant = reader->plant;
     if (plant->switch_count == PLANT_SWITCHES)
         return plant_text_fail(reader, "switch", "too many");
-    return plant_text_fields(reader, FIELDS(fields), rest, &plant->switches[plant->switch_count++]);
+    struct plant_switch *it = &plant->switches[plant->switch_count++];
+    it->bed = -1;
+    return plant_text_fields(reader, FIELDS(fields), rest, it);
+}
+
+static int read_bed(const struct plant_reader *reader, char *rest) {
+    static const struct plant_field fields[] = {
+        {"name", NAME, AT(plant_bed, name), 0, 0, 0},
+        {"z", NUMBER, AT(plant_bed, z), -1e3, 1e3, 1},
+        {"x0", NUMBER, AT(plant_bed, x0), -1e6, 1e6, 1},
+        {"y0", NUMBER, AT(plant_bed, y0), -1e6, 1e6, 1},
+        {"tilt_x", NUMBER, AT(plant_bed, tilt_x), -1, 1, 1},
+        {"tilt_y", NUMBER, AT(plant_bed, tilt_y), -1, 1, 1},
+        {"bow", NUMBER, AT(plant_bed, bow), -100, 100, 1},
+        {"radius", NUMBER, AT(plant_bed, radius), 1, 1e6, 1},
+    };
+    struct plant *plant = reader->plant;
+    if (plant->bed_count == PLANT_BEDS)
+        return plant_text_fail(reader, "bed", "too many");
+    struct plant_bed *bed = &plant->beds[plant->bed_count];
+    bed->radius = 100;
+    if (plant_text_fields(reader, FIELDS(fields), rest, bed))
+        return -1;
+    plant->bed_count++;
+    return 0;
+}
+
+static int read_probe(const struct plant_reader *reader, char *rest) {
+    static const struct plant_field fields[] = {
+        {"name", NAME, AT(plant_switch, name), 0, 0, 0},
+        {"pin", PIN, AT(plant_switch, pin), 0, 0, 0},
+        {"bed", BED, AT(plant_switch, bed), 0, 0, 0},
+        {"x", AXIS, AT(plant_switch, x_axis), 0, 0, 0},
+        {"y", AXIS, AT(plant_switch, y_axis), 0, 0, 0},
+        {"z", AXIS, AT(plant_switch, axis), 0, 0, 0},
+        {"slope_x", AXIS, AT(plant_switch, slope_x_axis), 0, 0, 1},
+        {"slope_y", AXIS, AT(plant_switch, slope_y_axis), 0, 0, 1},
+        {"offset_x", NUMBER, AT(plant_switch, offset_x), -1e3, 1e3, 1},
+        {"offset_y", NUMBER, AT(plant_switch, offset_y), -1e3, 1e3, 1},
+        {"offset_z", NUMBER, AT(plant_switch, offset_z), -1e3, 1e3, 1},
+        {"hysteresis", NUMBER, AT(plant_switch, hysteresis), 0, 100, 1},
+        {"noise", NUMBER, AT(plant_switch, noise), 0, 100, 1},
+        {"inverted", FLAG, AT(plant_switch, inverted), 0, 0, 1},
+    };
+    struct plant *plant = reader->plant;
+    if (plant->switch_count == PLANT_SWITCHES)
+        return plant_text_fail(reader, "probe", "too many switches");
+    struct plant_switch *it = &plant->switches[plant->switch_count++];
+    it->slope_x_axis = it->slope_y_axis = -1;
+    it->direction = -1;
+    return plant_text_fields(reader, FIELDS(fields), rest, it);
 }
 
 static int read_tmc(const struct plant_reader *reader, char *rest) {
@@ -331,7 +381,8 @@ static int read_line(const struct plant_reader *reader, char *line) {
         {"term", read_term},     {"switch", read_switch},   {"body", read_body},
         {"fan", read_fan},       {"couple", read_couple},   {"cooling", read_cooling},
         {"heater", read_heater}, {"sensor", read_sensor},   {"point", read_point},
-        {"tmc", read_tmc},       {"diag", read_diag},
+        {"tmc", read_tmc},       {"diag", read_diag},       {"bed", read_bed},
+        {"probe", read_probe},
     };
     line += strspn(line, " \t\r");
     if (!*line || *line == '#')

@@ -75,6 +75,51 @@ class Switch:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Bed:
+    """A bed, tilted and bowed.
+
+    Its height at x, y is z + tilt_x·dx + tilt_y·dy + bow·(1 - (dx² + dy²) / radius²), where dx is x - x0 and
+    dy is y - y0.
+    """
+
+    name: str = "bed"
+    z: float = 0.0
+    x0: float = 0.0
+    y0: float = 0.0
+    tilt_x: float = 0.0
+    """mm per mm, as ``tilt_y``."""
+    tilt_y: float = 0.0
+    bow: float = 0.0
+    """How much higher its middle is than a circle of ``radius`` around it."""
+    radius: float = 100.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Probe:
+    """A switch at the head that BED presses: pressed while the nozzle is OFFSET_Z above the bed, or lower.
+
+    OFFSET_X, OFFSET_Y: its place from the nozzle. X, Y and Z are axes; where SLOPE_X and SLOPE_Y are axes as
+    well (mm per mm), Z is the nozzle's height at x = y = 0. Hysteresis and noise as of a switch.
+    """
+
+    name: str
+    pin: str
+    bed: str
+    x: str
+    y: str
+    z: str
+    slope_x: str | None = None
+    slope_y: str | None = None
+    offset_x: float = 0.0
+    offset_y: float = 0.0
+    offset_z: float = 0.0
+    hysteresis: float = 0.0
+    noise: float = 0.0
+    inverted: bool = False
+    """Pressed is a low level."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Tmc:
     """The driver of a stepper of the same node, CHIP (tmc2208, tmc2209), on a UART.
 
@@ -239,6 +284,8 @@ class NodePlant:
     steppers: tuple[Stepper, ...] = ()
     axes: tuple[Axis, ...] = ()
     switches: tuple[Switch, ...] = ()
+    beds: tuple[Bed, ...] = ()
+    probes: tuple[Probe, ...] = ()
     tmcs: tuple[Tmc, ...] = ()
     diags: tuple[Diag, ...] = ()
     bodies: tuple[Body, ...] = ()
@@ -276,6 +323,8 @@ class NodePlant:
                 fields = {"axis": axis.name, "node": self._short(term.node), "stepper": term.stepper}
                 yield _line("term", fields | {"mm": term.mm_per_step})
         yield from self._parts("switch", self.switches)
+        yield from self._parts("bed", self.beds)
+        yield from self._parts("probe", self.probes)
         yield from self._parts("tmc", self.tmcs)
         yield from self._parts("diag", self.diags)
         yield from self._parts("body", self.bodies)

@@ -1,9 +1,9 @@
 """How a rail is homed: its endstop, and the speeds towards it."""
 
 from coordinator.config.errors import NotSupported
-from coordinator.config.model import HomingDescription
+from coordinator.config.model import PROBE_ENDSTOP, HomingDescription
 from coordinator.config.options import BoolOption, FloatOption, SectionReader
-from coordinator.config.pins import PinDescription, PinOption, PinRegistry
+from coordinator.config.pins import PinDescription, PinName, PinOption, PinRegistry
 from coordinator.config.sections.bounds import MAX_ACCEL, MAX_POSITION, MAX_SPEED
 from coordinator.config.sections.virtual_endstops import find_diag_pin
 
@@ -72,6 +72,8 @@ def read_endstop(reader: SectionReader, pins: PinRegistry) -> tuple[PinDescripti
         return None, ""
     if pin.name.endswith("virtual_endstop") and pin.node not in pins.nodes:
         virtual = f"{pin.node}:{pin.name}"
+        if virtual == PROBE_ENDSTOP and pins.probe is not None:
+            return _probe_pin(reader, pin, pins), virtual
         diag = find_diag_pin(reader, ENDSTOP_PIN, pin, pins)
         return (None if diag is None else pins.claim(diag, ENDSTOP_PIN, reader.section)), virtual
     try:
@@ -80,10 +82,22 @@ def read_endstop(reader: SectionReader, pins: PinRegistry) -> tuple[PinDescripti
         return None, f"{pin.node}:{pin.name}"
 
 
+def _probe_pin(reader: SectionReader, pin: PinName, pins: PinRegistry) -> PinDescription | None:
+    assert pins.probe is not None
+    if pin.invert or pin.pull:
+        raise reader.bad(ENDSTOP_PIN, "which takes no marks: put them before the pin of [probe]")
+    try:
+        return pins.claim(pins.probe.pin, ENDSTOP_PIN, reader.section)
+    except NotSupported:
+        return None
+
+
 def read_homing(reader: SectionReader, low: float, high: float, pins: PinRegistry) -> HomingDescription:
     """Return how a rail that goes from LOW to HIGH is homed; raises ConfigError."""
     endstop_pin, virtual = read_endstop(reader, pins)
     position = reader.find(POSITION_ENDSTOP)
+    if endstop_pin is not None and virtual == PROBE_ENDSTOP:
+        return _read_probe_homing(reader, endstop_pin, low, high, pins)
     if position is not None and not low <= position <= high:
         raise reader.bad(
             POSITION_ENDSTOP, f"must be within position_min and position_max ({low:g} to {high:g} mm)"
@@ -91,6 +105,25 @@ def read_homing(reader: SectionReader, low: float, high: float, pins: PinRegistr
     if position is None and endstop_pin is not None:
         reader.get(POSITION_ENDSTOP)  # required: raises
     return _homing(reader, (endstop_pin, virtual), position, _homing_direction(reader, position, low, high))
+
+
+def _read_probe_homing(
+    reader: SectionReader, pin: PinDescription, low: float, high: float, pins: PinRegistry
+) -> HomingDescription:
+    """Return how Z is homed by the probe: downwards, and its place follows from the z_offset of [probe]."""
+    assert pins.probe is not None
+    position = pins.probe.offset[2]
+    if reader.has(POSITION_ENDSTOP):
+        raise reader.bad(POSITION_ENDSTOP, "but the z_offset of [probe] is where Z is; remove it")
+    if reader.find(POSITIVE_DIR):
+        raise reader.bad(POSITIVE_DIR, "but a probe is lowered to the bed; remove it")
+    if not low <= position <= high:
+        raise reader.bad(
+            ENDSTOP_PIN,
+            f"but the z_offset of [probe], {position:g} mm, is outside position_min and position_max"
+            f" ({low:g} to {high:g} mm); lower position_min",
+        )
+    return _homing(reader, (pin, PROBE_ENDSTOP), position, positive_dir=False)
 
 
 def _homing_direction(reader: SectionReader, position: float | None, low: float, high: float) -> bool:

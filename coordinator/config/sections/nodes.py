@@ -23,6 +23,7 @@ from coordinator.config.options import (
     TextOption,
 )
 from coordinator.config.pins import MULTI_PIN, PRIMARY_NODE, PinOption, PinRegistry
+from coordinator.config.sections.probe import note_probe
 from coordinator.config.sections.virtual_endstops import note_diag_pins
 from coordinator.config.unsupported import UNSUPPORTED_MCU_OPTIONS
 from coordinator.support.quoting import nearest, shown
@@ -194,6 +195,7 @@ def make_pin_registry(config: ConfigFile, nodes: tuple[NodeDescription, ...]) ->
         if section.kind == "duplicate_pin_override":
             _read_shared(section, registry)
     note_diag_pins(config, registry)
+    note_probe(config, registry)
     _note_chips(config, registry)
     return registry
 

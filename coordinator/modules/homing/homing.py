@@ -8,22 +8,24 @@ level. A rail without an endstop on a pin is taken as home. What moves when is i
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import RailDescription
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Phases, ProgramContext, Reading
 from coordinator.gcode.events import Done
+from coordinator.gcode.parser import Command
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing_plan import AXES, Approach, approaches, landed, second_landed
-from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
+from coordinator.modules.homing.virtual_endstop import ProbeEndstop, StallEndstop, section_of
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.runtime.moves.homing import HomingMove, HomingResult
+from coordinator.runtime.moves.homing import HomingError, HomingMove, HomingResult
+from coordinator.runtime.moves.probing import check_over_bed, in_words_of_the_probe
 from coordinator.runtime.moves.single import Ramp, SingleMove
 from coordinator.runtime.moves.straight import move_by
 from coordinator.support.values import Value
@@ -31,6 +33,8 @@ from nodes.support.errors import CanductorError
 
 AWAY_MM: Final = 5.0
 """How far a rail that stands on its endstop goes away first, where homing_retract_dist is 0."""
+BELOW_MM: Final = 0.5
+"""How far below position_min the second approach of a probe may lead: its first one may have been lower."""
 
 
 ReadHome = Callable[[Call, str], Reading]
@@ -54,6 +58,7 @@ class Homing(Module):
         """Reads G28 in its place; a G28 among the lines that it stands for is homing again."""
         self.corrected: Callable[[ReadHome], ReadHome] | None = None
         """What homing finds, for programs whose X Y Z are not those of the axes."""
+        self._probe: ProbeEndstop | None = None
         build.add_command(GCodeCommand("M119", "Report which endstops are pressed", self._read_query))
         build.add_command(
             GCodeCommand("QUERY_ENDSTOPS", "Report which endstops are pressed", self._read_query)
@@ -81,7 +86,9 @@ class Homing(Module):
         self.instead = read
 
     def link(self, modules: Modules) -> None:
-        """Find the drivers that are to feel the end of an axis."""
+        """Find the drivers that are to feel the end of an axis, and the probe that is the endstop of Z."""
+        if self._by_probe:
+            self._probe = modules.find("probe", ProbeEndstop)
         for rail in (rail for approach in self._approaches for rail in approach.rails):
             virtual = rail.homing.virtual_endstop
             found = modules.find(section_of(virtual), StallEndstop) if virtual else None
@@ -96,7 +103,35 @@ class Homing(Module):
         """Read G28 of AXES (letters)."""
         if self.instead is not None and "G28" not in call.callers:
             return self.instead(call, axes)
-        return AtStandstill(lambda: self.home(call, axes))
+        if not self.has_lines(axes):
+            return AtStandstill(lambda: self.home(call, axes))
+        return Phases(lambda job: self._home_in_phases(job, call.command, axes))
+
+    def has_lines(self, axes: str) -> bool:
+        """Return whether homing AXES (letters) has to run lines of g-code on the way."""
+        return "Z" in axes and self._probe is not None and self._probe.has_lines
+
+    def _home_in_phases(self, job: ProgramContext, command: Command, axes: str) -> Iterator[Reading]:
+        if others := axes.replace("Z", ""):
+            call = job.call(command)
+            yield AtStandstill(lambda: self.home(call, others), self.taken_as_home(call, others))
+        yield from self.home_z_in_phases(job, command)
+
+    def home_z_in_phases(self, job: ProgramContext, command: Command) -> Iterator[Reading]:
+        """Home Z with the lines that its probe needs."""
+        assert self._probe is not None
+        yield self._probe.lines_before(job.call(command))
+        call = job.call(command)
+        yield AtStandstill(lambda: self.home(call, "Z"), self.taken_as_home(call, "Z"))
+        yield self._probe.lines_after(job.call(command))
+
+    def taken_as_home(self, call: Call, axes: str) -> Done:
+        """Return what a program that is only planned takes to come of homing AXES."""
+        x, y, z = (
+            home if letter in axes else at
+            for letter, home, at in zip("XYZ", self._described.home, call.position[:3], strict=True)
+        )
+        return Done(position=(x, y, z, call.position[3]), homed=axes)
 
     # ---------------------------------------------------------------------------------------------- homing
 
@@ -114,7 +149,7 @@ class Homing(Module):
             if rail.homing.waits:
                 return (
                     f"the endstop {rail.homing.virtual_endstop} ({rail.place}) is not supported yet; give the"
-                    " axis a switch as its endstop_pin"
+                    " axis a switch as its endstop_pin, or add [probe]"
                 )
         for stepper in self._described.motors:
             if stepper.name in approach.ways and stepper.unpowered:
@@ -125,6 +160,7 @@ class Homing(Module):
         """Home AXES (letters) from where CALL says that the machine stands; raises CanductorError."""
         self.check(axes)
         described = self._described
+        self._check_over_bed(call, axes)
         home = dict(zip("XYZ", described.home, strict=True))
         x, y, z, e = call.position
         place = (x, y, z)
@@ -151,6 +187,27 @@ class Homing(Module):
         place = await self._come_within(place, letters)
         return Done(position=(*place, e), homed=letters, moved=True, second_carriage_mm=second_mm)
 
+    def _check_over_bed(self, call: Call, axes: str) -> None:
+        """Raise CanductorError, before anything moves, where the probe would miss the bed."""
+        probe = self._described.probe
+        if probe is None or not self._by_probe or "Z" not in axes:
+            return
+        known = set(call.homed) | set(axes)
+        missing = next((letter for letter in "XY" if letter not in known), "")
+        if missing:
+            raise CanductorError(f"G28 of Z comes before {missing} is homed; home with G28 first")
+        place = self.taken_as_home(call, axes).position
+        assert place is not None
+        if why := check_over_bed(self._described, probe, place[0], place[1]):
+            raise CanductorError(
+                f"G28 of Z is refused: {why}; add [safe_z_home], or move the head there before"
+            )
+
+    @property
+    def _by_probe(self) -> bool:
+        probe = self._described.probe
+        return probe is not None and probe.rail.axis == "z"
+
     async def _approach(self, approach: Approach) -> list[float]:
         """Go to the endstops, twice if so configured; return how far beyond each trigger the rails stand."""
         rail = approach.rails[0]
@@ -160,12 +217,25 @@ class Homing(Module):
         results = await self._move(approach, approach.most_mm, homing.speed)
         if homing.retract_distance:
             await self._go_back(approach)
-            most_mm = 2 * homing.retract_distance + AWAY_MM
+            most_mm = self._most_again_mm(rail)
             results = await self._move(approach, most_mm, homing.second_speed)
         beyond_mm = [result.beyond_trigger_mm for result in results]
         if rail.axis in AXES:
             await self._align(approach, beyond_mm)
         return beyond_mm
+
+    @staticmethod
+    def _most_again_mm(rail: RailDescription) -> float:
+        """Return how far the second approach may go; a probe is not lowered beyond the end of Z for long."""
+        most_mm = 2 * rail.homing.retract_distance + AWAY_MM
+        if (
+            rail.homing.by_probe
+            and rail.position_min is not None
+            and rail.homing.position_endstop is not None
+        ):
+            room_mm = rail.homing.position_endstop - rail.position_min
+            most_mm = min(most_mm, rail.homing.retract_distance + room_mm + BELOW_MM)
+        return most_mm
 
     async def _come_within(self, place: "Point", letters: str) -> "Point":
         """Move axes that stopped behind their endstop beyond their range back into it; return where they are.
@@ -210,14 +280,23 @@ class Homing(Module):
             for rail in approach.rails:
                 if (feeler := self._feels(rail)) is not None:
                     await stack.enter_async_context(feeler.feeling(speed))
-            return await HomingMove(
+            move = HomingMove(
                 self._machine,
                 approach.rails,
                 ways=approach.ways,
                 way_mm=way_mm,
                 speed=speed,
                 accel=self._accel(approach.axis, approach.rails[0]),
-            ).run()
+            )
+            try:
+                return await move.run()
+            except HomingError as error:
+                if not approach.rails[0].homing.by_probe:
+                    raise
+                raise HomingError(
+                    f"Z was not homed: {in_words_of_the_probe(error)}; the head was lowered by"
+                    f" {move.planned_way_mm:.3f} mm"
+                ) from error
 
     def _feels(self, rail: "RailDescription") -> StallEndstop | None:
         return self._feelers.get(rail.homing.virtual_endstop)
@@ -242,7 +321,7 @@ class Homing(Module):
         return AtStandstill(self._query)
 
     async def _query(self) -> Done:
-        rails = self._described.stops
+        rails = [rail for rail in self._described.stops if rail.axis != "probe"]
         self._last_query = {rail.axis: await self._pressed(rail) for rail in rails}
         told = [f"{axis}:{'pressed' if pressed else 'open'}" for axis, pressed in self._last_query.items()]
         return Done((" ".join(told) or "this machine has no endstops on pins",), kind=ReplyKind.PLAIN)

@@ -1,12 +1,13 @@
 """[safe_z_home]: Z is homed at a place of its own, with the head lifted before anything moves sideways."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
 from coordinator.config.sections.bounds import MAX_SPEED
-from coordinator.gcode.commands import AtStandstill, Call, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Phases, Position, ProgramContext, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
@@ -106,9 +107,40 @@ class SafeZHome(Module):
         missing = "".join(axis for axis in "XY" if axis not in call.homed + axes)
         if "Z" in axes and missing:
             raise WordError(f"G28 of Z comes before {missing[0]} is homed; home with G28 first")
+        if self._homing.has_lines(axes):
+            return Phases(lambda job: self._home_in_phases(job, call, axes))
         return AtStandstill(lambda: self._home(call, axes))
 
+    def _home_in_phases(self, job: ProgramContext, call: Call, axes: str) -> Iterator[Reading]:
+        """Do as ``_home``, with the lines that the probe needs around the homing of Z."""
+        others = axes.replace("Z", "")
+        planned = self._homing.taken_as_home(call, others).position
+        assert planned is not None
+        before = [planned]
+
+        async def come() -> Done:
+            done, now, known = await self._approach_z(call, axes)
+            before[0] = known
+            return replace(done, position=now.position, homed=others, moved=True)
+
+        yield AtStandstill(come, Done(position=(*self._place, *planned[2:]), homed=others))
+        yield from self._homing.home_z_in_phases(job, call.command)
+        homed = job.call(call.command)
+
+        async def leave() -> Done:
+            return Done(position=(await self._withdraw(homed, before[0])).position, moved=True)
+
+        yield AtStandstill(leave)
+
     async def _home(self, call: Call, axes: str) -> Done:
+        done, call, known = await self._approach_z(call, axes)
+        if "Z" in axes:
+            call = _after(call, await self._homing.home(call, "Z"))
+            call = await self._withdraw(call, known)
+        return replace(done, position=call.position, homed=axes, moved=True)
+
+    async def _approach_z(self, call: Call, axes: str) -> tuple[Done, Call, Position]:
+        """Home all but Z and go to where Z is homed; return also the place before that."""
         if "Z" in axes and self._outside:
             raise CanductorError(
                 f"G28 of Z is refused: home_xy_position of [{self.name}] is {self._outside}; correct it"
@@ -119,14 +151,14 @@ class SafeZHome(Module):
         if others := axes.replace("Z", ""):
             done = await self._homing.home(call, others)
             call = _after(call, done)
+        known = call.position
         if "Z" in axes:
-            known = call.position
             call = await self._go(call, *self._place)
-            call = _after(call, await self._homing.home(call, "Z"))
-            call = await self._lift(call)
-            if self._back:
-                call = await self._go(call, known[0], known[1])
-        return replace(done, position=call.position, homed=axes, moved=True)
+        return done, call, known
+
+    async def _withdraw(self, call: Call, known: Position) -> Call:
+        call = await self._lift(call)
+        return await self._go(call, known[0], known[1]) if self._back else call
 
     async def _lift(self, call: Call) -> Call:
         """Lift the head to the height of the hop, or by as much where its height is not known."""

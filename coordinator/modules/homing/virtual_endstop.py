@@ -2,6 +2,7 @@
 
 from contextlib import AbstractAsyncContextManager
 
+from coordinator.gcode.commands import Call, Lines
 from coordinator.modules.base import Module
 
 
@@ -13,6 +14,23 @@ class StallEndstop(Module):
 
         Raises CanductorError.
         """
+        raise NotImplementedError
+
+
+class ProbeEndstop(Module):
+    """A module whose probe may be the endstop of Z."""
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether lines of g-code are run before or after a move towards it."""
+        raise NotImplementedError
+
+    def lines_before(self, call: Call) -> Lines:
+        """Return the lines that make it ready."""
+        raise NotImplementedError
+
+    def lines_after(self, call: Call) -> Lines:
+        """Return the lines that put it away."""
         raise NotImplementedError
 
 

@@ -1,1 +1,1 @@
-"""Finding a height: by hand, later by probes."""
+"""Finding a height: by hand, by probes."""

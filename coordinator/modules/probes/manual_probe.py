@@ -38,6 +38,8 @@ class ManualProbe(Module):
         """What a height that is accepted leads to; None: nothing is looked for."""
         self._speed = SPEED
         self._tried: list[float] = []
+        self._z = 0.0
+        """Where the nozzle is while a height is looked for."""
         for name, text, read in (
             ("MANUAL_PROBE", "Begin to look for a height by hand; SPEED in mm/s", self._read_probe),
             ("Z_ENDSTOP_CALIBRATE", "Find position_endstop of stepper_z by hand", self._read_calibrate),
@@ -61,17 +63,24 @@ class ManualProbe(Module):
         self._live = live
 
     def status(self) -> dict[str, Value]:
-        """Return whether a height is looked for."""
-        return {"is_active": self._accepted is not None}
+        """Return whether a height is looked for, and between which of those that were tried."""
+        active, z = self._accepted is not None, self._z
+        below, above = self._beside(z) if active else (None, None)
+        return {
+            "is_active": active,
+            "z_position": z if active else None,
+            "z_position_lower": below,
+            "z_position_upper": above,
+        }
 
     # ----------------------------------------------------------------------------------------------- begin
 
     def _read_probe(self, call: Call) -> Reading:
-        return self._begin(call, lambda z: (f"Z position is {z:.3f}",))
+        return self._begin_at_speed(call, lambda z: (f"Z position is {z:.3f}",))
 
     def _read_calibrate(self, call: Call) -> Reading:
         endstop = self._endstop(call)
-        return self._begin(call, lambda z: self._keep(endstop - z))
+        return self._begin_at_speed(call, lambda z: self._keep(endstop - z))
 
     def _read_apply(self, call: Call) -> Reading:
         call.parameters()
@@ -92,7 +101,7 @@ class ManualProbe(Module):
                     return found
         raise WordError(f"{call.command.name} needs a position_endstop of [stepper_z]; this machine has none")
 
-    def _begin(self, call: Call, accepted: Callable[[float], tuple[str, ...]]) -> Reading:
+    def _begin_at_speed(self, call: Call, accepted: Callable[[float], tuple[str, ...]]) -> Reading:
         values = call.parameters("SPEED")
         speed = number(call.command.name, values, "SPEED") if "SPEED" in values else SPEED
         if not 0 < speed <= self._machine.limits.max_z_velocity:
@@ -100,10 +109,23 @@ class ManualProbe(Module):
                 f"SPEED of {call.command.name} is {speed:g}; it must be above 0 and at most"
                 f" {self._machine.limits.max_z_velocity:g} mm/s"
             )
+        return self.begin(call, accepted, speed)
+
+    def check_free(self, call: Call) -> None:
+        """Raise WordError where no height can be looked for."""
         if "Z" not in call.homed:
             raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
         if self._accepted is not None:
             raise WordError(f"{call.command.name}: a height is looked for already; ACCEPT or ABORT that")
+
+    def begin(
+        self, call: Call, accepted: Callable[[float], tuple[str, ...]], speed: float = SPEED
+    ) -> Reading:
+        """Return what begins to look for a height, of which ACCEPTED makes replies.
+
+        TESTZ goes at SPEED, mm/s. Raises WordError.
+        """
+        self.check_free(call)
 
         def act(job: ProgramContext) -> bool:
             self._accepted, self._speed, self._tried = accepted, speed, []
@@ -154,7 +176,7 @@ class ManualProbe(Module):
         return (below[-1] if below else None), (above[0] if above else None)
 
     def _tell(self, job: ProgramContext) -> None:
-        z = job.planner.toolhead_position[2]
+        z = self._z = job.planner.toolhead_position[2]
         below, above = ("?" if tried is None else f"{tried:.3f}" for tried in self._beside(z))
         job.emit(Reply(job.line, f"Z position: {below} --> {z:.3f} <-- {above}"))
 

@@ -25,7 +25,7 @@ _KINDS: Final[Mapping[str, Callable[[], Status]]] = {
     },
     **dict.fromkeys(("z_tilt", "z_tilt_ng", "quad_gantry_level"), lambda: {"applied": False}),
     **dict.fromkeys(
-        ("probe", "bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe", "dockable_probe"),
+        ("bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe", "dockable_probe"),
         _probe,
     ),
     **dict.fromkeys(

@@ -51,6 +51,19 @@ class HomingError(CanductorError):
     """An axis could not be homed; the sentence says why and what to do."""
 
 
+class AlreadyPressedError(HomingError):
+    """The endstop was pressed before the move towards it."""
+
+
+class EndstopNotFoundError(HomingError):
+    """The endstop did not switch on the whole way."""
+
+    def __init__(self, sentence: str, way_mm: float) -> None:
+        super().__init__(sentence)
+        self.way_mm = way_mm
+        """How long that was."""
+
+
 class _LateError(HomingError):
     """The nodes were not armed in time; all are stopped again."""
 
@@ -150,6 +163,17 @@ class HomingMove:
         self._ramp = Ramp(way_mm, speed, accel)
         self._heard_s: dict[tuple[int, str], float] = {}
         self._changed = asyncio.Event()
+        self._move: SingleMove | None = None
+        self._ends_at_s = 0.0
+        """Print time at which one of the nodes stops by itself when it hears nothing more."""
+
+    @property
+    def planned_way_mm(self) -> float:
+        """How far the move can have led by now, as it was planned and before nodes stop by themselves, mm."""
+        if self._move is None:
+            return 0.0
+        until_s = min(self._move.print_time_now(), self._ends_at_s)
+        return self._ramp.way_at(until_s - self._move.begin_s)
 
     async def run(self) -> tuple[HomingResult, ...]:
         """Move until every endstop switched; raises HomingError with everything stopped."""
@@ -165,12 +189,13 @@ class HomingMove:
         for rail in self._rails:
             node = self._machine.nodes[devices.endstop_node(rail)]
             if await self._is_pressed(rail, node):
-                raise HomingError(
+                raise AlreadyPressedError(
                     f"the endstop of axis {rail.axis} is pressed before the move towards it; move the axis "
                     "away by hand, or check the endstop's wiring and whether its pin has to be inverted"
                 )
         began_at = await self._machine.query_stepper_counts()
         move = SingleMove(self._machine, self._ramp, self._ratio, ways=self._ways, lead_s=lead_s)
+        self._move, self._ends_at_s = move, move.begin_s + TIMEOUT_ALONE_S
         legs = [self._leg(slot, rail, move) for slot, rail in enumerate(self._rails)]
         ends: list[Callable[[], None]] = []
         late: _LateError | None = None
@@ -299,6 +324,7 @@ class HomingMove:
         heard_s = min(self._heard_s[leg.slot, node.name] for node, _ in leg.syncs)
         if leg.triggered.is_set() or heard_s <= move.begin_s:
             return
+        self._ends_at_s = heard_s + leg.timeout_s
         for node, sync in leg.syncs:
             sync.renew(node, move.ticks_at(node.name, heard_s + leg.timeout_s))
 
@@ -326,9 +352,10 @@ class HomingMove:
                     f"{leg.timeout_s:g} s and stopped by itself; check the bus for errors and load"
                 )
         if not _switched(leg, states):
-            raise HomingError(
+            raise EndstopNotFoundError(
                 f"axis {leg.name} moved {self._ramp.way_mm:g} mm and its endstop did not switch; "
-                "check the endstop's wiring, the direction of the axis, and homing_positive_dir"
+                "check the endstop's wiring, the direction of the axis, and homing_positive_dir",
+                self._ramp.way_mm,
             )
 
     # ------------------------------------------------------------------------------------------ afterwards

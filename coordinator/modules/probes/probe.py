@@ -1,0 +1,314 @@
+"""What all probes have in common: a part of the head that finds how high the bed is.
+
+A measurement is a sequence of phases (gcode/commands.py): the lines of ``activate_gcode``, the way down until
+the probe triggers, the lines of ``deactivate_gcode``, a lift, and that again until there are enough samples.
+Modules that level something ask for places by ``begin``, ``measure`` and ``end``.
+"""
+
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from coordinator.config.errors import ConfigError
+from coordinator.config.options import (
+    BoolOption,
+    ChoiceOption,
+    FloatOption,
+    GCodeOption,
+    IntOption,
+    Option,
+)
+from coordinator.config.sections.bounds import MAX_SPEED
+from coordinator.config.sections.probe import OFFSETS, Z_OFFSET
+from coordinator.gcode.builtins.state import go
+from coordinator.gcode.commands import (
+    AtStandstill,
+    Call,
+    Immediate,
+    Lines,
+    ProgramContext,
+    Reading,
+    ToProgram,
+)
+from coordinator.gcode.events import Done
+from coordinator.gcode.parser import Command, WordError, quoted
+from coordinator.kinematics.base import Point
+from coordinator.modules.base import Build
+from coordinator.modules.homing.virtual_endstop import ProbeEndstop
+from coordinator.modules.probes.samples import AVERAGE, MEDIAN, SampleRules, SampleSeries
+from coordinator.modules.programs.gcode_macro import GCodeTemplate
+from coordinator.modules.words import bounded, parameters
+from coordinator.runtime.module_context import ModuleContext
+from coordinator.runtime.moves.probing import Contact, ProbingMove, downwards
+from coordinator.support.values import Value
+from nodes.support.errors import CanductorError
+
+SPEED: Final = FloatOption(
+    name="speed", help="speed of the way down", default=5.0, unit="mm/s", above=0, maximum=MAX_SPEED
+)
+LIFT_SPEED: Final = FloatOption(
+    name="lift_speed",
+    help="speed of the way up between samples; by default speed",
+    unit="mm/s",
+    above=0,
+    maximum=MAX_SPEED,
+)
+SAMPLES: Final = IntOption(name="samples", help="how often each place is measured", default=1, minimum=1)
+RETRACT: Final = FloatOption(
+    name="sample_retract_dist",
+    help="how far the head is lifted between samples",
+    default=2.0,
+    unit="mm",
+    above=0,
+    maximum=1000,
+)
+RESULT: Final = ChoiceOption(
+    name="samples_result", help="what the samples become", default=AVERAGE, choices=(AVERAGE, MEDIAN)
+)
+TOLERANCE: Final = FloatOption(
+    name="samples_tolerance",
+    help="how far the samples of a place may be apart",
+    default=0.1,
+    unit="mm",
+    minimum=0,
+    maximum=1000,
+)
+RETRIES: Final = IntOption(
+    name="samples_tolerance_retries",
+    help="how often all samples of a place are taken again where they are further apart",
+    default=0,
+    minimum=0,
+)
+DROP_FIRST: Final = BoolOption(
+    name="drop_first_result", help="whether the first measurement of a place does not count", default=False
+)
+ACTIVATE: Final = GCodeOption(name="activate_gcode", help="what is done before the way down", default="")
+DEACTIVATE: Final = GCodeOption(name="deactivate_gcode", help="what is done after it", default="")
+EACH: Final = BoolOption(
+    name="deactivate_on_each_sample",
+    help="whether these are done for each sample; else once for all places of a command",
+    default=True,
+)
+PARAMETERS: Final = (
+    *("PROBE_SPEED", "LIFT_SPEED", "SAMPLES", "SAMPLE_RETRACT_DIST", "SAMPLES_TOLERANCE"),
+    *("SAMPLES_TOLERANCE_RETRIES", "SAMPLES_RESULT"),
+)
+"""Of the commands that measure, in the place of options."""
+SAME_MM: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Measuring:
+    """How a command measures."""
+
+    speed: float
+    lift_speed: float
+    retract_mm: float
+    rules: SampleRules
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What was found at one place, mm."""
+
+    nozzle: Point
+    """X and Y of the nozzle, and its height when the probe triggered."""
+    bed: Point
+    """Where the probe found the bed, and how high it is there."""
+
+
+Phase = Generator[Reading, None, Measured | None]
+
+
+OPTIONS: Final[tuple[Option[Any], ...]] = (
+    *(*OFFSETS, Z_OFFSET, SPEED, LIFT_SPEED, SAMPLES, RETRACT, RESULT, TOLERANCE, RETRIES, DROP_FIRST),
+    *(ACTIVATE, DEACTIVATE, EACH),
+)
+"""Of every probe."""
+
+
+class Probe(ProbeEndstop):
+    """The probe; PROBE and the like are in probe_commands.py, the kinds of probes in files of their own."""
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        x, y = (build.get(option) for option in OFFSETS)
+        self.offset: Point = (x, y, build.get(Z_OFFSET))
+        """From the nozzle: X, Y, and how high that is when the probe triggers, mm."""
+        speed = build.get(SPEED)
+        self.measuring = Measuring(
+            speed,
+            build.find(LIFT_SPEED) or speed,
+            build.get(RETRACT),
+            SampleRules(
+                samples=build.get(SAMPLES),
+                result=build.get(RESULT),
+                tolerance_mm=build.get(TOLERANCE),
+                retries=build.get(RETRIES),
+                drop_first=build.get(DROP_FIRST),
+            ),
+        )
+        self._activate = GCodeTemplate(build, ACTIVATE)
+        self._deactivate = GCodeTemplate(build, DEACTIVATE)
+        self._each = build.get(EACH)
+        if downwards(build.machine) is None:
+            raise ConfigError(
+                build.place,
+                f"[{build.name}] has no use on a machine of kinematics {build.machine.kinematics.name}: its"
+                " motors do not lower the head by the same way everywhere; remove it",
+            )
+        self._lowest_z = build.machine.limits.position_min[2]
+        self._live: ModuleContext | None = None
+        self.last_query = False
+        self._last: Measured | None = None
+
+    async def connect(self, live: ModuleContext) -> None:
+        """Take over the machine."""
+        self._live = live
+
+    def status(self) -> Mapping[str, Value]:
+        """Report what was found last."""
+        bed = (0.0, 0.0, 0.0) if self._last is None else self._last.bed
+        return {
+            "name": self.name,
+            "last_query": self.last_query,
+            "last_probe_position": list(bed),
+            "last_z_result": 0.0 if self._last is None else self._last.nozzle[2],
+        }
+
+    def keep(self, found: Measured) -> None:
+        """Show FOUND as what PROBE found last."""
+        self._last = found
+
+    # ---------------------------------------------------------------------------------- as endstop of Z
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether it is activated or deactivated by g-code."""
+        return bool(self._activate.text.strip() or self._deactivate.text.strip())
+
+    def lines_before(self, call: Call) -> Lines:
+        """Return the lines that activate it."""
+        return self._activate.lines(call, {})
+
+    def lines_after(self, call: Call) -> Lines:
+        """Return the lines that deactivate it."""
+        return self._deactivate.lines(call, {})
+
+    # ------------------------------------------------------------------------------------------ measuring
+
+    def how(self, command: Command) -> Measuring:
+        """Return how COMMAND measures: as configured, but for its PARAMETERS; raises WordError."""
+        given = parameters(command, (*PARAMETERS,))
+        own, rules = self.measuring, self.measuring.rules
+        result = given.get("SAMPLES_RESULT", rules.result).lower()
+        if result not in (AVERAGE, MEDIAN):
+            raise WordError(
+                f"SAMPLES_RESULT of {command.name} is {quoted(result)}; {AVERAGE} or {MEDIAN} is possible"
+            )
+
+        def read(key: str, default: float, low: float, high: float) -> float:
+            return bounded(command, given, key, default, low=low, high=high)
+
+        return Measuring(
+            read("PROBE_SPEED", own.speed, 1e-3, MAX_SPEED),
+            read("LIFT_SPEED", own.lift_speed, 1e-3, MAX_SPEED),
+            read("SAMPLE_RETRACT_DIST", own.retract_mm, 1e-3, 1000),
+            replace(
+                rules,
+                samples=round(read("SAMPLES", rules.samples, 1, 10_000)),
+                result=result,
+                tolerance_mm=read("SAMPLES_TOLERANCE", rules.tolerance_mm, 0, 1000),
+                retries=round(read("SAMPLES_TOLERANCE_RETRIES", rules.retries, 0, 10_000)),
+            ),
+        )
+
+    def check(self, call: Call) -> None:
+        """Raise WordError where nothing can be measured."""
+        if "Z" not in call.homed:
+            raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
+
+    def begin(self, job: ProgramContext, command: Command) -> Iterator[Reading]:
+        """Make ready for the places of COMMAND."""
+        if not self._each:
+            yield from self._run_lines(job, command, self._activate)
+
+    def end(self, job: ProgramContext, command: Command) -> Iterator[Reading]:
+        """Put away what ``begin`` made ready."""
+        if not self._each:
+            yield from self._run_lines(job, command, self._deactivate)
+
+    def measure(self, job: ProgramContext, command: Command, how: Measuring) -> Phase:
+        """Measure where the head is, which is left where the probe triggered; None: it is only planned."""
+        series = SampleSeries(how.rules)
+        while True:
+            contact = yield from self.touch(job, command, how)
+            if contact is None:
+                return None
+            found = self._found(contact, contact.trigger_z)
+            yield Immediate((f"probe at {found.bed[0]:.3f},{found.bed[1]:.3f} is z={contact.trigger_z:.6f}",))
+            if remark := series.take(contact.trigger_z):
+                yield Immediate((remark,))
+            if series.is_complete:
+                break
+            yield from lift(job, contact.position[2] + how.retract_mm, how.lift_speed)
+        if series.failed:
+            raise WordError(f"{command.name} failed: {series.failed}")
+        return self._found(contact, series.result)
+
+    def touch(
+        self, job: ProgramContext, command: Command, how: Measuring
+    ) -> Generator[Reading, None, Contact | None]:
+        """Lower the head once until the probe triggers; None: it is only planned."""
+        found: list[Contact] = []
+        if self._each:
+            yield from self._run_lines(job, command, self._activate)
+        call = job.call(command)
+
+        async def go_down() -> Done:
+            assert self._live is not None
+            move = ProbingMove(
+                self._live.machine,
+                call.position,
+                lowest_z=self._lowest_z,
+                speed=how.speed,
+                say=self._live.say,
+            )
+            try:
+                found.append(await move.run())
+            except CanductorError as error:
+                if self._live.machine.stopped is not None:
+                    raise
+                raise CanductorError(f"{command.name} failed: {error}") from error
+            return Done(position=found[0].position, moved=True)
+
+        yield AtStandstill(go_down)
+        if not found:
+            return None
+        if self._each:
+            yield from self._run_lines(job, command, self._deactivate)
+        return found[0]
+
+    def _found(self, contact: Contact, height: float) -> Measured:
+        x, y, _ = contact.trigger
+        dx, dy, dz = self.offset
+        return Measured((x, y, height), (x + dx, y + dy, height - dz))
+
+    def _run_lines(self, job: ProgramContext, command: Command, template: GCodeTemplate) -> Iterator[Reading]:
+        """Run lines that must leave the head where it is."""
+        if not template.text.strip():
+            return
+        before = job.planner.toolhead_position[:3]
+        yield template.lines(job.call(command), {})
+        after = job.planner.toolhead_position[:3]
+        if any(abs(here - there) > SAME_MM for here, there in zip(after, before, strict=True)):
+            raise WordError(
+                f"{command.name}: the lines that activate or deactivate [{self.name}] moved the head; let"
+                " them bring it back"
+            )
+
+
+def lift(job: ProgramContext, z: float, speed: float) -> Iterator[Reading]:
+    """Move to Z at SPEED, X and Y as they are."""
+    x, y, _, e = job.planner.toolhead_position
+    yield ToProgram(lambda job: go(job, [x, y, z, e], speed))
