@@ -16,7 +16,7 @@ UNSUPPORTED_SECTIONS = frozenset(
         *_words("bltouch smart_effector probe_eddy_current axis_twist_compensation load_cell"),
         *_words("load_cell_probe"),
         *_words("dockable_probe z_calibration tools_calibrate"),
-        *_words("bed_mesh bed_tilt bed_screws screws_tilt_adjust z_tilt z_tilt_ng quad_gantry_level"),
+        *_words("bed_tilt bed_screws screws_tilt_adjust z_tilt z_tilt_ng quad_gantry_level"),
         *_words("z_thermal_adjust endstop_phase"),
         *_words("gcode_shell_command sdcard_loop"),
         *_words("resonance_tester shaketune adxl345 icm20948 lis2dw lis3dh bmi160 mpu9250 angle"),

@@ -17,6 +17,7 @@ from coordinator.modules.heaters.sections import ExtruderHeaterSection, HeaterBe
 from coordinator.modules.heaters.verify_heater import VerifyHeater
 from coordinator.modules.homing.homing_override import HomingOverride
 from coordinator.modules.homing.safe_z_home import SafeZHome
+from coordinator.modules.levelling.bed_mesh import BedMeshSection
 from coordinator.modules.levelling.skew_correction import SkewCorrection
 from coordinator.modules.motion.firmware_retraction import FirmwareRetraction
 from coordinator.modules.motion.force_move import ForceMove
@@ -41,6 +42,7 @@ ENTRY_POINTS: Final = "canductor.modules"
 """Name: the section's first word; value: ``package.module:Class``."""
 MODULES: Final[dict[str, type[Module]]] = {
     "adc_temperature": AdcTemperature,
+    "bed_mesh": BedMeshSection,
     "controller_fan": ControllerFan,
     "delayed_gcode": DelayedGCode,
     "display_status": DisplayStatus,

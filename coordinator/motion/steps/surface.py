@@ -35,7 +35,7 @@ class Surface:
         """Of nodes along X and along Y."""
         self.nodes = np.ascontiguousarray(nodes, dtype=np.float64)
         self.fade_mm = fade_mm
-        self._memory = ffi.from_buffer("double[]", self.nodes)
+        self._memory = ffi.from_buffer("double[]", self.nodes.data)
         grid: Any = ffi.new("struct step_surface *")
         grid.points_y, grid.points_x = self.nodes.shape[:2]
         grid.from_x, grid.from_y = origin_mm
@@ -47,8 +47,8 @@ class Surface:
         if not lib.step_surface_is_legal(self.grid):
             raise StepError(
                 f"the shape of the bed is refused: it has to be a grid of 2 to {NODES_MAX} points both ways,"
-                " at least 0.1 mm apart, whose height nowhere changes by more than 0.5 mm per mm, also where it"
-                " fades; probe the bed again, or let it fade over more height"
+                " at least 0.1 mm apart, whose height nowhere changes by more than 0.5 mm per mm, also where"
+                " it fades; probe the bed again, or let it fade over more height"
             )
 
     @property

@@ -1,0 +1,129 @@
+"""Places that are probed one after the other: the options that name them, and the ways between them."""
+
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from coordinator.config.options import BadValue, BoolOption, FloatOption, Option
+from coordinator.config.sections.bounds import MAX_POSITION, MAX_SPEED
+from coordinator.gcode.builtins.state import go
+from coordinator.gcode.commands import ProgramContext, Reading, ToProgram
+from coordinator.gcode.parser import Command
+from coordinator.modules.base import Build
+from coordinator.modules.levelling.surfaces import Place
+from coordinator.modules.probes.probe import Measured, Measuring, Probe, lift
+from coordinator.modules.words import bounded, parameters
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacesOption(Option[tuple[Place, ...]]):
+    """X and Y of several places, a line each."""
+
+    least: int = 1
+    most: int = 1000
+
+    def parse(self, text: str) -> tuple[Place, ...]:
+        """Return them."""
+        number = FloatOption(name="", help="", minimum=-MAX_POSITION, maximum=MAX_POSITION)
+        places = []
+        for line in (line.strip() for line in text.splitlines()):
+            if not line:
+                continue
+            words = [word.strip() for word in line.split(",")]
+            if len(words) != 2:
+                raise BadValue
+            places.append((number.parse(words[0]), number.parse(words[1])))
+        if not self.least <= len(places) <= self.most:
+            raise BadValue
+        return tuple(places)
+
+    def rule(self) -> str:
+        """Return what is allowed."""
+        count = f"{self.least}" if self.least == self.most else f"{self.least} or more"
+        return f"{count} places, each X and Y in mm with a comma between them, on a line of its own"
+
+    def stand_in(self) -> tuple[Place, ...]:
+        """Return any places."""
+        return tuple((float(number), float(number % 2)) for number in range(self.least))
+
+    def setting(self, text: str, value: tuple[Place, ...]) -> object:
+        """Return them as lists."""
+        del text
+        return [list(place) for place in value]
+
+
+TRAVEL_SPEED: Final = FloatOption(
+    name="speed",
+    help="speed of the ways between places",
+    default=50.0,
+    unit="mm/s",
+    above=0,
+    maximum=MAX_SPEED,
+)
+HEIGHT: Final = FloatOption(
+    name="horizontal_move_z",
+    help="height of the ways between places",
+    default=5.0,
+    unit="mm",
+    minimum=-MAX_POSITION,
+    maximum=MAX_POSITION,
+)
+BY_PROBE: Final = BoolOption(
+    name="use_probe_xy_offsets",
+    help="whether the places are those of the probe; else those of the nozzle",
+    default=False,
+)
+OPTIONS: Final[tuple[Option[Any], ...]] = (TRAVEL_SPEED, HEIGHT, BY_PROBE)
+
+
+class ProbePoints:
+    """The PLACES of a section, with its OPTIONS."""
+
+    def __init__(
+        self, build: Build, places: Sequence[Place] = (), *, by_probe: BoolOption = BY_PROBE
+    ) -> None:
+        self.places = tuple(places)
+        self._speed, self._height = build.get(TRAVEL_SPEED), build.get(HEIGHT)
+        self._by_probe = build.get(by_probe)
+
+    def height(self, command: Command) -> float:
+        """Return how high the head travels by COMMAND, or as configured; raises WordError."""
+        given = parameters(command, ("HORIZONTAL_MOVE_Z",))
+        return bounded(
+            command, given, "HORIZONTAL_MOVE_Z", self._height, low=-MAX_POSITION, high=MAX_POSITION
+        )
+
+    def measure(
+        self,
+        job: ProgramContext,
+        command: Command,
+        probe: Probe,
+        how: Measuring,
+        places: Sequence[Place] | None = None,
+    ) -> Generator[Reading, None, list[Measured] | None]:
+        """Measure all places (or PLACES) in turn; None: it is only planned. It ends at travel height."""
+        height = self.height(command)
+        found = []
+        yield from probe.begin(job, command)
+        for place in self.places if places is None else places:
+            yield from self.travel(job, probe, place, height, how.lift_speed)
+            measured = yield from probe.measure(job, command, how)
+            if measured is None:
+                return None
+            found.append(measured)
+        yield from lift(job, height, how.lift_speed)
+        yield from probe.end(job, command)
+        return found
+
+    def travel(
+        self, job: ProgramContext, probe: Probe, place: Place, height: float, lift_speed: float
+    ) -> Iterator[Reading]:
+        """Bring the nozzle, or the probe, above PLACE."""
+        yield from lift(job, height, lift_speed)
+        dx, dy = probe.offset[:2] if self._by_probe else (0.0, 0.0)
+        x, y, speed = place[0] - dx, place[1] - dy, self._speed
+
+        def act(job: ProgramContext) -> bool:
+            return go(job, [x, y, *job.planner.toolhead_position[2:]], speed)
+
+        yield ToProgram(act)
