@@ -90,6 +90,45 @@ static double add_taps(const struct step_gen *gen, struct stepper *s, unsigned a
     return end;
 }
 
+static void look_at_axes(const struct step_gen *gen, struct stepper *s, int index) {
+    const struct tap *tap = &gen->taps[index];
+    struct seen *seen = &s->seen[index];
+    struct motion m;
+    step_locate(gen, &s->cursor[index], s->time - tap->time, &m);
+    *seen = (struct seen){.time = s->time, .border = m.border + tap->time, .still = true};
+    for (int j = AXIS_X; j <= AXIS_Z; j++) {
+        const double v = speed_of(&m, j), a = accel_of(&m, j), share = tap->amplitude[j];
+        seen->axis[j][0] = share * place_of(&m, j);
+        seen->axis[j][1] = share * v;
+        seen->axis[j][2] = share * a / 2;
+        seen->still &= share == 0 || (v == 0 && a == 0);
+    }
+}
+
+// The axes of a stepper over a bed, as ``add_taps`` does: there may be many pieces between two of its steps.
+static double add_seen_axes(const struct step_gen *gen, struct stepper *s, struct piece *p) {
+    double end = HUGE_VAL;
+    for (int i = 0; i < gen->tap_count; i++) {
+        struct seen *seen = &s->seen[i];
+        if (!(gen->taps[i].axes & s->uses))
+            continue;
+        if (is_over(seen->border, s->time))
+            look_at_axes(gen, s, i);
+        const double t = s->time - seen->time;
+        for (int j = AXIS_X; j <= AXIS_Z; j++) {
+            const double a = seen->axis[j][2];
+            p->axis[j][0] += seen->axis[j][0] + t * (seen->axis[j][1] + t * a);
+            p->axis[j][1] += seen->axis[j][1] + 2 * t * a;
+            p->axis[j][2] += a;
+        }
+        p->still &= seen->still;
+        end = seen->border < end ? seen->border : end;
+        if (seen->border == HUGE_VAL)
+            seen->border = -HUGE_VAL; // a move may be appended at any time
+    }
+    return end;
+}
+
 static double add_axes(const struct step_gen *gen, struct stepper *s, struct piece *p) {
     double end = HUGE_VAL;
     for (int i = 0; i < gen->tap_count; i++) {
@@ -116,7 +155,10 @@ static void make_piece(const struct step_gen *gen, struct stepper *s, double unt
     *p = (struct piece){.begin = s->time, .linear = !s->config.formula && !s->follows_bed, .still = true};
     p->smooth = p->linear && s->smooth_s > 0 && s->uses & USES_E;
     const unsigned axes = p->smooth ? s->uses & ~(unsigned)USES_E : s->uses;
-    double end = fmin(until, p->linear ? add_taps(gen, s, axes, p) : add_axes(gen, s, p));
+    const double border = p->linear        ? add_taps(gen, s, axes, p)
+                          : s->follows_bed ? add_seen_axes(gen, s, p)
+                                           : add_axes(gen, s, p);
+    double end = fmin(until, border);
     if (p->smooth) {
         double smooth[5];
         const double scale = s->config.weights[AXIS_E] / s->config.step_distance;
@@ -170,6 +212,21 @@ static double bed_cut(const struct step_gen *gen, const struct stepper *s, const
     double speed;
     evaluate(gen, s, p, from, &speed);
     return from + fmax(SPAN_S, fabs(speed) * s->config.step_distance / change);
+}
+
+// Whether a linear stepper over a bed can reach no step in the piece, from where it was last evaluated:
+// mostly.
+static bool reaches_nothing(const struct step_gen *gen, const struct stepper *s, const struct piece *p) {
+    if (s->config.formula || p->still)
+        return false;
+    double far[3]; // mm, no further does an axis get from there
+    for (int i = 0; i < 3; i++)
+        far[i] = fabs(p->axis[i][0] - s->known_at[i]) + fastest(p->axis[i], 0, p->seconds) * p->seconds;
+    const double *weights = s->config.weights;
+    double most = fabs(weights[AXIS_Z]) * step_surface_change(&gen->surface, far);
+    for (int i = 0; i < 3; i++)
+        most += fabs(weights[i]) * far[i];
+    return fabs(s->known_off) + most / s->config.step_distance < 0.5 - 2.0 / STEP_SNAP;
 }
 
 // The first time after FROM behind which the stepper's speed may behave otherwise.
@@ -341,10 +398,20 @@ static int play_span(struct step_gen *gen, struct stepper *s, const struct piece
 
 static int play_piece(struct step_gen *gen, struct stepper *s, const struct piece *p) {
     double speed;
+    if (s->follows_bed && reaches_nothing(gen, s, p))
+        return STEP_OK;
     const double off = evaluate(gen, s, p, 0, &speed) - (double)s->position;
     if (s->time != s->checked && !(fabs(off) <= JUMP_STEPS))
         return step_fail(gen, STEP_JUMP, s, p->begin, off);
     s->checked = s->time;
+    if (s->follows_bed) {
+        for (int i = 0; i < 3; i++)
+            s->known_at[i] = p->axis[i][0];
+        s->known_off = off;
+        if (reaches_nothing(gen, s, p))
+            return STEP_OK;
+        s->known_off = HUGE_VAL; // it steps on
+    }
     for (double from = 0; from < p->seconds;) {
         double to = next_cut(gen, s, p, from);
         if (!p->still && (!p->linear || p->smooth))

@@ -27,6 +27,7 @@ enum {
 // which hold before BORDER.
 struct seen {
     double time, border, poly[3];
+    double axis[3][3]; // X Y Z, mm: of a stepper over a bed, instead of POLY
     bool still;
 };
 
@@ -63,6 +64,7 @@ struct stepper {
     // A stepper whose steps are not those of one move after the other: see step_curve.c.
     bool curve;
     bool follows_bed;               // its place depends on the shape of the bed
+    double known_at[3], known_off;  // X Y Z where that was last evaluated, and how far from its steps it was
     unsigned uses;                  // axes, a bit each
     double time, border;            // s: solved up to; to be solved up to
     double checked;                 // s, where it was last seen to be where it should; -1: nowhere

@@ -204,6 +204,10 @@ bool step_surface_is_smooth(const struct surface *s, double x0, double x1, doubl
            (z0 == z1 || z1 <= g->fade_from || z0 >= g->fade_to);
 }
 
+double step_surface_change(const struct surface *s, const double far[3]) {
+    return s->slope_x * far[AXIS_X] + s->slope_y * far[AXIS_Y] + STEEPEST * far[AXIS_Z];
+}
+
 double step_surface_bend(const struct surface *s, double vx, double vy, double ax, double ay) {
     return s->bend_xx * vx * vx + 2 * s->bend_xy * vx * vy + s->bend_yy * vy * vy + s->slope_x * ax +
            s->slope_y * ay;

@@ -29,6 +29,9 @@ void step_surface_add(const struct surface *surface, double *at, double *v);
 bool step_surface_is_smooth(const struct surface *surface, double x0, double x1, double y0, double y1,
                             double z0, double z1);
 
+// The bound of how the height changes when X, Y and Z change by FAR, mm.
+double step_surface_change(const struct surface *surface, const double far[3]);
+
 // The bound of the second derivative of the height by time, mm/s², for speeds and accelerations of X and Y.
 double step_surface_bend(const struct surface *surface, double vx, double vy, double ax, double ay);
 
