@@ -107,7 +107,7 @@ def _is_one_of_many(option: Option[object]) -> bool:
 def _row(option: Option[object]) -> str:
     default = option.default
     if isinstance(default, tuple):
-        default = ", ".join(default)
+        default = ", ".join(f"{value:g}" if isinstance(value, float) else str(value) for value in default)
     text = "" if default is None else f"{default:g}" if isinstance(default, float) else str(default)
     return f"| `{option.name}` | {option.rule()} | {text} | {option.help} |"
 

@@ -48,11 +48,12 @@ class PendingConfig:
     def __init__(self, source: ConfigSource | None) -> None:
         self._source = source
         self._pending: dict[str, dict[str, str]] = {}
+        self._removed: set[str] = set()
 
     @property
     def pending(self) -> Values:
-        """What would be written, by section."""
-        return self._pending
+        """What would be written, by section; nothing of a section that would be removed."""
+        return self._pending | {section: {} for section in sorted(self._removed)}
 
     def put(self, section: str, option: str, text: str) -> None:
         """Keep a value until ``write``; raises SaveError for one that no file can hold."""
@@ -60,6 +61,16 @@ class PendingConfig:
         text = "\n".join(line.strip() for line in text.strip().split("\n"))
         _check({section: {option: text}})
         self._pending.setdefault(section, {})[option] = text
+        self._removed.discard(section)
+
+    def remove(self, section: str) -> None:
+        """Have SECTION left out of the block; raises SaveError where it does not come from the block."""
+        section = " ".join(section.split())
+        if self._source is not None and section in self._source.saved:
+            self._removed.add(section)
+        elif section not in self._pending:
+            raise SaveError(f"[{section}] was not saved by the machine: remove it from the file by hand")
+        self._pending.pop(section, None)
 
     def write(self) -> str:
         """Write all into the file and return its path; raises SaveError. It may take as long as a disk does.
@@ -70,12 +81,15 @@ class PendingConfig:
         if source is None:
             raise SaveError("nothing can be saved: this machine does not come from a file")
         merged = {section: dict(options) for section, options in source.saved.items()}
+        for section in self._removed:
+            del merged[section]
         for section, options in self._pending.items():
             merged.setdefault(section, {}).update(options)
         data = with_block(source.data, merged)
         replace_file(source.path, source.data, data)
         self._source = ConfigSource(source.path, data, merged)
         self._pending = {}
+        self._removed = set()
         return source.path
 
 

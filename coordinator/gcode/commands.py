@@ -36,7 +36,7 @@ class Call:
     line: int
     """Of the program."""
     position: Position
-    """Where the moves before it lead to, in the machine's frame; X Y Z E, mm."""
+    """Where the moves before it lead the motors, in the machine's frame and with the shape of the bed; mm."""
     homed: str
     """Letters of the axes that are homed then."""
     callers: tuple[str, ...] = ()

@@ -11,6 +11,7 @@ PositionSet     takes all trapezoids, then sets the position of step generation
 ShaperChange,   takes all trapezoids, generates their steps up to PRINT_TIME_S with flush, then changes
 WeightsChange,  step generation; the machine has been at rest for longer than every shaper and every
 SmoothTime-     smoothing window is wide
+Change, Surface-
 Change
 Timed           calls ACT with the print time at which the next move begins; continues meanwhile
 Standstill-     takes all trapezoids; in real time, waits until PRINT_TIME_S has been executed, has it
@@ -25,6 +26,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
 from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.motion.steps.surface import Surface
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +121,15 @@ class SmoothTimeChange:
     print_time_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class SurfaceChange:
+    """From PRINT_TIME_S on Z follows the shape SURFACE (None: a plane); a PositionSet follows."""
+
+    line: int
+    surface: Surface | None
+    print_time_s: float
+
+
 AS_SOON_AS_POSSIBLE = -1
 
 
@@ -186,7 +197,7 @@ class End:
     print_time_s: float
 
 
-MachineChange = ShaperChange | WeightsChange | SmoothTimeChange
+MachineChange = ShaperChange | WeightsChange | SmoothTimeChange | SurfaceChange
 """Changes of what step generation does with the same moves."""
 Event = (
     Progress

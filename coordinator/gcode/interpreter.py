@@ -361,7 +361,8 @@ class Job(ProgramContext):
         callers = tuple(inner.name for inner in self._inner)
         active = self.machine.active
         extruder = active.name if active is not None else ""
-        position, figures = planner.toolhead_position, partial(motion_figures, planner, self.machine)
+        position = self.machine.motor_position(planner.toolhead_position)
+        figures = partial(motion_figures, planner, self.machine)
         return Call(
             command, self.line, position, planner.homed, callers, extruder, figures, self.while_printing
         )
@@ -411,11 +412,12 @@ class Job(ProgramContext):
         planner.homed = "".join(axis for axis in planner.homed if axis not in done.unhomed)
         if done.position is None:
             return
-        planner.set_position(done.position)
+        position = self.machine.planned_position(done.position)
+        planner.set_position(position)
         planner.clear_gcode_base(done.homed)
         planner.homed = planner.homed + done.homed
         machine_commands.home_carriages(self, done.homed, done.second_carriage_mm)
-        self._events.append(PositionSet(self.line, done.homed, done.position, planner.print_time_end_s))
+        self._events.append(PositionSet(self.line, done.homed, position, planner.print_time_end_s))
 
     def _reply(self, texts: tuple[str, ...], kind: ReplyKind = ReplyKind.INFORMATION) -> None:
         self._events.extend(Reply(self.line, text, kind) for text in texts)

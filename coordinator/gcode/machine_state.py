@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 from coordinator.kinematics.base import Weights
 from coordinator.kinematics.dual_carriage import CarriageState, DualCarriage
 from coordinator.kinematics.extruder import ExtruderMotion
+from coordinator.motion.planner.planner import Position
 from coordinator.motion.specs import MotionLimits
+from coordinator.motion.steps.surface import Surface
 
 SHAPER_AXES = "XYZ"
 DEFAULT_STATE = "default"
@@ -90,11 +92,23 @@ class MachineState:
     """By name."""
     follows: Mapping[str, Weights] = field(default_factory=dict)
     """What motors (by name) follow whose axes are corrected; others follow what they are described to."""
+    surface: Surface | None = None
+    """The shape of the bed that Z follows; None: a plane."""
 
     @property
     def active(self) -> Extruder | None:
         """The extruder that E stands for."""
         return self.extruders[self.filament.active] if self.filament and self.filament.active else None
+
+    def motor_position(self, planned: Position) -> Position:
+        """Return where the motors have the head at a PLANNED place: with the shape of the bed."""
+        x, y, z, e = planned
+        return planned if self.surface is None else (x, y, self.surface.motor_z(x, y, z), e)
+
+    def planned_position(self, motors: Position) -> Position:
+        """Return the place that is planned where MOTORS have the head at one."""
+        x, y, z, e = motors
+        return motors if self.surface is None else (x, y, self.surface.planned_z(x, y, z), e)
 
     def tool(self, number: int) -> Extruder | None:
         """Return the extruder of tool NUMBER, or None."""

@@ -37,7 +37,9 @@ from nodes.support.errors import CanductorError
 M = TypeVar("M", bound=Module)
 K = TypeVar("K")
 IDLE_TIMEOUT: Final = "idle_timeout"
-FREE_NAMES: Final = frozenset(("G2", "G3", "G5", "G17", "G18", "G19", "M118", "M201", "M203", "M205"))
+FREE_NAMES: Final = frozenset(
+    ("G2", "G3", "G5", "G17", "G18", "G19", "M118", "M201", "M203", "M205", "BED_MESH_CHECK")
+)
 """Commands of ours that other hosts do not have by themselves: macros take their names as they come."""
 INTERRUPTING: Final = frozenset(("PAUSE", "CANCEL_PRINT"))
 """Commands that pause or cancel a job, whatever macros they may be."""

@@ -16,13 +16,15 @@ from coordinator.gcode.events import (
     Progress,
     ShaperChange,
     SmoothTimeChange,
+    SurfaceChange,
     WeightsChange,
 )
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
-from coordinator.motion.steps.steps import StepError, StepGenerator
+from coordinator.motion.steps.errors import StepError
+from coordinator.motion.steps.steps import StepGenerator
 from coordinator.planning.figures import PlanFigures
 from coordinator.planning.options import PlanOptions
 from coordinator.planning.report import PlanReport
@@ -156,7 +158,7 @@ def _run(pipeline: Pipeline, display: ProgressDisplay) -> tuple[list[str], End]:
         match event:
             case Full():
                 pipeline.run_through()
-            case PositionSet() | ShaperChange() | WeightsChange() | SmoothTimeChange():
+            case PositionSet() | ShaperChange() | WeightsChange() | SmoothTimeChange() | SurfaceChange():
                 pipeline.finish()
                 pipeline.act(event)
             case Progress():

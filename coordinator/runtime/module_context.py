@@ -72,6 +72,10 @@ class ModuleContext:
         """Save a calibrated value with the next SAVE_CONFIG; raises SaveError for text it cannot write."""
         self.machine.unsaved.put(section, option, text)
 
+    def remove_saved(self, section: str) -> None:
+        """Have SAVE_CONFIG remove a section that it wrote; raises SaveError for one that the user wrote."""
+        self.machine.unsaved.remove(section)
+
     def stop(self, cause: str) -> None:
         """Stop the whole machine for safety: CAUSE is a sentence with what to do."""
         self.machine.stop(cause)

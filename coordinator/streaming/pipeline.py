@@ -18,6 +18,7 @@ from coordinator.gcode.events import (
     PositionSet,
     ShaperChange,
     SmoothTimeChange,
+    SurfaceChange,
     Timed,
     WeightsChange,
 )
@@ -25,6 +26,7 @@ from coordinator.gcode.machine_state import SHAPER_AXES, Shaper
 from coordinator.motion.planner.planner import Planner, Position
 from coordinator.motion.steps.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps.steps import StepGenerator
+from coordinator.motion.steps.surface import Surface
 from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.runtime.filament_forecast import FilamentForecast
 from coordinator.streaming.compensation import Compensation
@@ -49,6 +51,8 @@ class MotionSettings:
     """By stepper, of those that were given others than their configuration says."""
     windows_s: Mapping[str, float]
     """By filament stepper: the window over which pressure advance is spread."""
+    surface: Surface | None = None
+    """The shape of the bed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +151,7 @@ class Pipeline:
         self._shapers: dict[str, Shaper] = {}
         self._weights: dict[str, Position] = {}
         self._windows_s: dict[str, float] = {}
+        self._surface: Surface | None = None
         self.moves = 0
         """Trapezoids handed to step generation."""
         self.moved_until = 0.0
@@ -181,6 +186,8 @@ class Pipeline:
                 self._smooth()
             case SmoothTimeChange():
                 self._smooth()
+            case SurfaceChange():
+                self._follow_bed(event.surface)
         self._note_settings()
         self.planner.begin_at(self.steps.next_move_s)
 
@@ -195,6 +202,7 @@ class Pipeline:
             self._follow(machine.carriages.weights(machine.carriage_state))
         self._follow(machine.follows)
         self._smooth()
+        self._follow_bed(machine.surface)
         self._note_settings()
         self.planner.begin_at(self.steps.next_move_s)
 
@@ -203,7 +211,7 @@ class Pipeline:
         if self._record is None:
             return
         shapers = {axis: shaper for axis, shaper in self._shapers.items() if shaper.frequency_hz}
-        settings = MotionSettings(shapers, dict(self._weights), dict(self._windows_s))
+        settings = MotionSettings(shapers, dict(self._weights), dict(self._windows_s), self._surface)
         self._record.settings.append((self._record.count, settings))
 
     def _shape(self, axis: str, shaper: Shaper) -> None:
@@ -229,6 +237,10 @@ class Pipeline:
             window_s = machine.extruders[extruder].window_s if extruder else 0.0
             self.steps.set_smooth_time(self.steps.index(stepper), window_s)
             self._windows_s[stepper] = window_s
+
+    def _follow_bed(self, surface: Surface | None) -> None:
+        self._surface = surface
+        self.steps.set_surface(surface)
 
     def _declare(self, event: PositionSet) -> None:
         before = self.steps.corrections if self._compensation is not None else ()

@@ -222,7 +222,8 @@ class MotionWorker:
         carriages = self._job.machine.carriage_state
         if isinstance(event, PositionSet):
             offsets = [correction.offset_mm for correction in self.steps.corrections]
-            self._machine.stepper_positions.declare(event.position, self._counts(), carriages, offsets)
+            position = self._job.machine.motor_position(event.position)
+            self._machine.stepper_positions.declare(position, self._counts(), carriages, offsets)
         else:
             self._machine.stepper_positions.use(carriages)
 

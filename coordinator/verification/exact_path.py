@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.motion.specs import StepperSpec
+from coordinator.verification.exact_bed import ExactBed
 from coordinator.verification.exact_signal import REST_S, Floats, Phases, Shaped, Signal, Smoothed
 
 Ints = NDArray[np.int64]
@@ -22,6 +23,9 @@ Position = tuple[float, float, float, float]
 AxisSignal = Signal | Shaped | Smoothed
 UNSHAPED: Impulses = ((1.0, 0.0),)
 SNAP = 65536
+PARTS_OF_PATCH = 8
+"""A piece over a bed is looked at in so many parts of a patch's width, and in so many at least."""
+FORMULAS_WITH_Z = ("delta", "deltesian", "winch", "rotary_delta")
 PIECES = 1 << 16
 """Looked at together: bounds the memory that long programs take."""
 SAMPLES = 7
@@ -41,11 +45,13 @@ class Setting:
     """By axis letter (X, Y, Z)."""
     smooth_s: float = 0.0
     """Full width of the window of pressure advance; 0: none."""
+    bed: ExactBed | None = None
+    """The shape of the bed that Z follows."""
 
     def acts_on(self, weights: Position) -> bool:
         """Return whether a linear stepper of these WEIGHTS moves otherwise than its axes."""
         shaped = any(weights["XYZ".index(axis)] for axis in self.shapers)
-        return bool(shaped or (self.smooth_s and weights[3]))
+        return bool(shaped or (self.smooth_s and weights[3]) or (self.bed is not None and weights[2]))
 
 
 # ---------------------------------------------------------------------------------------- kinematics
@@ -123,11 +129,14 @@ class StepperPath:
         """POSITION: where the stepper stands at START, in steps."""
         self.spec = spec
         phases = Phases.of(start, moves)
-        if spec.formula is None:
+        by_bed = setting.bed is not None and (spec.formula in FORMULAS_WITH_Z or spec.weights[2] != 0)
+        self._bed = setting.bed if by_bed else None
+        self._by_axes = spec.formula is not None or self._bed is not None
+        if not self._by_axes:
             self._axes: list[AxisSignal] = _linear(spec.weights, phases, setting)
         else:
             self._axes = [_axis(axis, 1.0, phases, setting) for axis in range(3)]
-        self.curved = spec.formula is not None or any(not isinstance(axis, Signal) for axis in self._axes)
+        self.curved = self._by_axes or any(not isinstance(axis, Signal) for axis in self._axes)
         """Not one straight move after the other: then the end of a move is no rest."""
         self._origin = 0.0
         self._origin = float(self.u(np.array([REST_S]))[0]) - position
@@ -135,10 +144,12 @@ class StepperPath:
     def u(self, t: Floats, near: Floats | None = None) -> Floats:
         """Return the place at T; of an angle the turn that is next to NEAR (steps)."""
         at = [axis.at(t) for axis in self._axes]
-        if self.spec.formula is None:
+        if self._bed is not None:
+            at[2] = self._bed.motor_z(*at)
+        if not self._by_axes:
             place: Floats = sum(at[1:], at[0])
         else:
-            place = INVERSE[self.spec.formula](self.spec.params, *at)[0]
+            place = self._inverse(at)[0]
         u = place / self.spec.step_distance - self._origin
         if near is not None and self.spec.formula == "polar_angle":
             turn = math.tau / self.spec.step_distance
@@ -148,16 +159,38 @@ class StepperPath:
     def slope(self, t: Floats) -> Floats:
         """Return du/dt, steps/s."""
         speed = [axis.slope(t) for axis in self._axes]
-        if self.spec.formula is None:
+        if not self._by_axes:
             rate: Floats = sum(speed[1:], speed[0])
         else:
-            gradient = INVERSE[self.spec.formula](self.spec.params, *(axis.at(t) for axis in self._axes))[1]
+            at = [axis.at(t) for axis in self._axes]
+            if self._bed is not None:
+                speed[2] = self._bed.motor_speed(at, speed)
+                at[2] = self._bed.motor_z(*at)
+            gradient = self._inverse(at)[1]
             rate = sum((g * v for g, v in zip(gradient, speed, strict=True)), np.zeros_like(t))
         return rate / self.spec.step_distance
 
     def breaks(self) -> Floats:
         """Return the times between which u is smooth, rising."""
-        return np.unique(np.concatenate([axis.breaks() for axis in self._axes]))
+        breaks = np.unique(np.concatenate([axis.breaks() for axis in self._axes]))
+        if self._bed is None:
+            return breaks
+        # Over a bed's patches u turns where nothing of the plan does: few turns lie within a part of a patch.
+        passed = self._bed.patches_passed(self._axes[0].at(breaks), self._axes[1].at(breaks))
+        parts = np.maximum(np.ceil(passed * PARTS_OF_PATCH), PARTS_OF_PATCH).astype(int)
+        pieces = [
+            np.linspace(begin, end, count, endpoint=False)
+            for begin, end, count in zip(breaks[:-1], breaks[1:], parts, strict=True)
+        ]
+        return np.concatenate((*pieces, breaks[-1:]))
+
+    def _inverse(self, at: Sequence[Floats]) -> tuple[Floats, Gradient]:
+        if self.spec.formula is not None:
+            return INVERSE[self.spec.formula](self.spec.params, *at)
+        weights = self.spec.weights[:3]
+        place: Floats = sum((w * x for w, x in zip(weights, at, strict=True)), np.zeros_like(at[0]))
+        x, y, z = (np.full_like(at[0], weight) for weight in weights)
+        return place, (x, y, z)
 
 
 def _linear(weights: Position, phases: Phases, setting: Setting) -> list[AxisSignal]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from coordinator.motion.specs import StepperSpec
 from coordinator.streaming.pipeline import MotionSettings, Segment
+from coordinator.verification.exact_bed import ExactBed
 from coordinator.verification.exact_path import Leg, Setting
 from coordinator.verification.exact_shapers import impulses
 
@@ -28,4 +29,5 @@ def _setting(settings: MotionSettings, stepper: str) -> Setting:
         axis: impulses(shaper.kind, shaper.frequency_hz, shaper.damping_ratio)
         for axis, shaper in settings.shapers.items()
     }
-    return Setting(shapers, settings.windows_s.get(stepper, 0.0))
+    bed = None if settings.surface is None else ExactBed(settings.surface)
+    return Setting(shapers, settings.windows_s.get(stepper, 0.0), bed)

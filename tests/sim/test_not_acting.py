@@ -16,6 +16,7 @@ sensor_pin: PA9
 z_offset: 1
 [bed_mesh]
 mesh_min: 10, 10
+mesh_max: 90, 90
 [neopixel light]
 pin: PA10
 [extruder]

@@ -159,7 +159,7 @@ class MotorLevelling(Module):
         height = None
         self.applied = False
         for number in range(1, retries + 2):
-            found = yield from self._points.measure(job, command, self._probe, how, height)
+            found = yield from self._points.measure(job, command, self._probe, how, height=height)
             if found is None:
                 return
             spread = yield from self._level(

@@ -2,7 +2,7 @@
 
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option
 from coordinator.config.sections.bounds import MAX_POSITION, MAX_SPEED
@@ -73,16 +73,18 @@ BY_PROBE: Final = BoolOption(
     help="whether the places are those of the probe; else those of the nozzle",
     default=False,
 )
-OPTIONS: Final[tuple[Option[object], ...]] = (TRAVEL_SPEED, HEIGHT, BY_PROBE)  # type: ignore[assignment]
+OPTIONS: Final[tuple[Option[Any], ...]] = (TRAVEL_SPEED, HEIGHT, BY_PROBE)
 
 
 class ProbePoints:
     """The PLACES of a section, with its OPTIONS."""
 
-    def __init__(self, build: Build, places: Sequence[Place]) -> None:
+    def __init__(
+        self, build: Build, places: Sequence[Place] = (), *, by_probe: BoolOption = BY_PROBE
+    ) -> None:
         self.places = tuple(places)
         self._speed, self._height = build.get(TRAVEL_SPEED), build.get(HEIGHT)
-        self._by_probe = build.get(BY_PROBE)
+        self._by_probe = build.get(by_probe)
 
     def height(self, command: Command) -> float:
         """Return how high the head travels by COMMAND, or as configured; raises WordError."""
@@ -97,13 +99,15 @@ class ProbePoints:
         command: Command,
         probe: Probe,
         how: Measuring,
+        *,
         height: float | None = None,
+        places: Sequence[Place] | None = None,
     ) -> Generator[Reading, None, list[Measured] | None]:
-        """Measure all places in turn; None: it is only planned. The head ends at travel HEIGHT."""
+        """Measure all places (or PLACES) in turn; None: it is only planned. It ends at travel HEIGHT."""
         height = self.height(command) if height is None else height
         found = []
         yield from probe.deploy(job, command)
-        for place in self.places:
+        for place in self.places if places is None else places:
             yield from self.travel(job, probe, place, height, how.lift_speed)
             measured = yield from probe.measure(job, command, how)
             if measured is None:

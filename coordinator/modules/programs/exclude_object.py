@@ -66,6 +66,16 @@ class ExcludeObject(Module):
         """Forget the objects of another program."""
         self.forget()
 
+    def outlines(self) -> list[list[tuple[float, float]]]:
+        """Return the polygon of each object of the program, or its centre where it has none."""
+        found = []
+        for each in tuple(self._objects.values()):
+            if each.polygon:
+                found.append([*each.polygon])
+            elif each.center is not None:
+                found.append([each.center])
+        return found
+
     @property
     def leaves_out(self) -> bool:
         """Whether what is being read is an excluded object."""

@@ -69,6 +69,7 @@ void step_forget(struct stepper *s) {
     for (int i = 0; i < STEP_TAPS + 3; i++)
         s->seen[i].border = -HUGE_VAL;
     s->trusted = 0;
+    s->known_off = HUGE_VAL;
 }
 
 static void add_tap(struct step_gen *gen, int axis, double amplitude, double time) {
@@ -103,9 +104,11 @@ static unsigned axes_used(const struct step_stepper_config *config) {
 void step_choose_way(struct step_gen *gen, struct stepper *s) {
     step_forget(s);
     s->uses = axes_used(&s->config);
+    s->follows_bed = gen->surface.grid.points_x && s->uses & STEP_USES_Z;
+    s->uses |= s->follows_bed ? STEP_USES_X | STEP_USES_Y : 0;
     const bool smooth = s->smooth_s > 0 && s->uses & USES_E;
     s->reach = s->lag = smooth ? s->smooth_s / 2 : 0;
-    s->curve = smooth || s->config.formula;
+    s->curve = smooth || s->config.formula || s->follows_bed;
     for (int i = 0; i < gen->tap_count; i++)
         if (gen->taps[i].axes & s->uses) {
             s->reach = fmax(s->reach, -gen->taps[i].time);

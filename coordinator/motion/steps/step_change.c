@@ -68,12 +68,14 @@ static double mix(const double *weights, const double *position) {
     return sum;
 }
 
-double step_absolute(struct stepper *s, const double *position) {
-    static const double still[AXES];
-    double speed;
+double step_absolute(const struct step_gen *gen, struct stepper *s, const double *position) {
+    double at[AXES], still[AXES] = {0}, speed;
+    memcpy(at, position, sizeof(at));
+    if (s->follows_bed)
+        step_surface_add(&gen->surface, at, still);
     if (!s->config.formula)
-        return mix(s->config.weights, position) / s->config.step_distance;
-    s->angle = s->config.formula->position(s->config.params, s->angle, position, still, &speed);
+        return mix(s->config.weights, at) / s->config.step_distance;
+    s->angle = s->config.formula->position(s->config.params, s->angle, at, still, &speed);
     return s->angle / s->config.step_distance;
 }
 
@@ -90,13 +92,13 @@ static int set_motor_position(struct step_gen *gen, const double *position) {
     for (int i = 0; i < AXES; i++)
         shift[i] = position[i] - shift[i];
     for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
-        if (!settled && s->curve && s->config.formula)
+        if (!settled && s->curve && (s->config.formula || s->follows_bed))
             return STEP_NOT_IDLE;
     for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
         if (!settled && s->curve)
             s->origin += mix(s->config.weights, shift) / s->config.step_distance;
         else
-            s->origin = step_absolute(s, position) - (double)s->position;
+            s->origin = step_absolute(gen, s, position) - (double)s->position;
     for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
         step_forget(s);
     // Moves that still act are shifted, as if they had led here.
@@ -247,19 +249,26 @@ int step_set_shaper(struct step_gen *gen, int axis, int n, const double *amplitu
     return STEP_OK;
 }
 
+// Smoothing of E is for sums of axes; a stepper that follows a bed is none.
+static bool moves_z_and_e(const double *weights) {
+    return weights[AXIS_Z] != 0 && weights[AXIS_E] != 0;
+}
+
 int step_set_weights(struct step_gen *gen, int stepper, const double *weights) {
     if (stepper < 0 || stepper >= gen->stepper_count || gen->steppers[stepper].config.formula)
         return STEP_BAD_CONFIG;
     for (int i = 0; i < AXES; i++)
         if (!(fabs(weights[i]) < LONGEST_S))
             return STEP_BAD_CONFIG;
+    if (gen->surface.grid.points_x && moves_z_and_e(weights))
+        return STEP_BAD_CONFIG;
     if (!may_change(gen))
         return STEP_NOT_IDLE;
     struct stepper *s = &gen->steppers[stepper];
     start_afresh(gen);
-    const double before = step_absolute(s, gen->rest);
+    const double before = step_absolute(gen, s, gen->rest);
     memcpy(s->config.weights, weights, sizeof(s->config.weights));
-    s->origin += step_absolute(s, gen->rest) - before;
+    s->origin += step_absolute(gen, s, gen->rest) - before;
     start_afresh(gen);
     return STEP_OK;
 }
@@ -271,6 +280,29 @@ int step_set_smooth_time(struct step_gen *gen, int stepper, double smooth_s) {
         return STEP_NOT_IDLE;
     gen->steppers[stepper].smooth_s = smooth_s;
     start_afresh(gen);
+    return STEP_OK;
+}
+
+int step_set_surface(struct step_gen *gen, const struct step_surface *grid, double *z) {
+    if (!step_surface_is_legal(grid))
+        return STEP_BAD_CONFIG;
+    for (const struct stepper *s = gen->steppers; grid->points_x && s < gen->steppers + gen->stepper_count;
+         s++)
+        if (!s->config.formula && moves_z_and_e(s->config.weights))
+            return STEP_BAD_CONFIG;
+    if (!may_change(gen))
+        return STEP_NOT_IDLE;
+    start_afresh(gen);
+    double at[AXES], still[AXES] = {0};
+    memcpy(at, gen->rest, sizeof(at));
+    if (gen->surface.grid.points_x)
+        step_surface_add(&gen->surface, at, still);
+    step_surface_set(&gen->surface, grid);
+    gen->rest[AXIS_Z] = step_surface_planned_z(&gen->surface.grid, at[AXIS_X], at[AXIS_Y], at[AXIS_Z]);
+    start_afresh(gen);
+    planned_position(gen, at);
+    step_table_stand(&gen->tables[AXIS_Z], at[AXIS_Z], gen->tables[AXIS_Z].offset);
+    *z = at[AXIS_Z];
     return STEP_OK;
 }
 

@@ -13,7 +13,7 @@ static inline bool step_in_range(double value, double low, double high) {
 }
 
 // The stepper's position at POSITION, in steps, not counted from its origin.
-double step_absolute(struct stepper *stepper, const double *position);
+double step_absolute(const struct step_gen *gen, struct stepper *stepper, const double *position);
 
 // What depends on how fast the stepper's node counts.
 void step_set_tick_limits(struct stepper *stepper, double max_error_s);

@@ -25,7 +25,8 @@ struct piece {
 };
 
 // The position since init at TIME after the piece's begin, in steps, and its speed.
-static double evaluate(const struct stepper *s, const struct piece *p, double t, double *speed) {
+static double evaluate(const struct step_gen *gen, const struct stepper *s, const struct piece *p, double t,
+                       double *speed) {
     const double *c = p->poly;
     if (p->linear) {
         *speed = c[1] + t * (2 * c[2] + t * (3 * c[3] + t * 4 * c[4]));
@@ -36,7 +37,15 @@ static double evaluate(const struct stepper *s, const struct piece *p, double t,
         at[i] = p->axis[i][0] + t * (p->axis[i][1] + t * p->axis[i][2]);
         v[i] = p->axis[i][1] + 2 * t * p->axis[i][2];
     }
-    const double u = s->config.formula->position(s->config.params, s->angle, at, v, speed);
+    if (s->follows_bed)
+        step_surface_add(&gen->surface, at, v);
+    double u = 0;
+    *speed = 0;
+    if (s->config.formula)
+        u = s->config.formula->position(s->config.params, s->angle, at, v, speed);
+    else
+        for (int i = 0; i < AXES; i++)
+            u += s->config.weights[i] * at[i], *speed += s->config.weights[i] * v[i];
     *speed /= s->config.step_distance;
     return u / s->config.step_distance - s->origin;
 }
@@ -81,6 +90,45 @@ static double add_taps(const struct step_gen *gen, struct stepper *s, unsigned a
     return end;
 }
 
+static void look_at_axes(const struct step_gen *gen, struct stepper *s, int index) {
+    const struct tap *tap = &gen->taps[index];
+    struct seen *seen = &s->seen[index];
+    struct motion m;
+    step_locate(gen, &s->cursor[index], s->time - tap->time, &m);
+    *seen = (struct seen){.time = s->time, .border = m.border + tap->time, .still = true};
+    for (int j = AXIS_X; j <= AXIS_Z; j++) {
+        const double v = speed_of(&m, j), a = accel_of(&m, j), share = tap->amplitude[j];
+        seen->axis[j][0] = share * place_of(&m, j);
+        seen->axis[j][1] = share * v;
+        seen->axis[j][2] = share * a / 2;
+        seen->still &= share == 0 || (v == 0 && a == 0);
+    }
+}
+
+// The axes of a stepper over a bed, as ``add_taps`` does: there may be many pieces between two of its steps.
+static double add_seen_axes(const struct step_gen *gen, struct stepper *s, struct piece *p) {
+    double end = HUGE_VAL;
+    for (int i = 0; i < gen->tap_count; i++) {
+        struct seen *seen = &s->seen[i];
+        if (!(gen->taps[i].axes & s->uses))
+            continue;
+        if (is_over(seen->border, s->time))
+            look_at_axes(gen, s, i);
+        const double t = s->time - seen->time;
+        for (int j = AXIS_X; j <= AXIS_Z; j++) {
+            const double a = seen->axis[j][2];
+            p->axis[j][0] += seen->axis[j][0] + t * (seen->axis[j][1] + t * a);
+            p->axis[j][1] += seen->axis[j][1] + 2 * t * a;
+            p->axis[j][2] += a;
+        }
+        p->still &= seen->still;
+        end = seen->border < end ? seen->border : end;
+        if (seen->border == HUGE_VAL)
+            seen->border = -HUGE_VAL; // a move may be appended at any time
+    }
+    return end;
+}
+
 static double add_axes(const struct step_gen *gen, struct stepper *s, struct piece *p) {
     double end = HUGE_VAL;
     for (int i = 0; i < gen->tap_count; i++) {
@@ -104,10 +152,13 @@ static double add_axes(const struct step_gen *gen, struct stepper *s, struct pie
 }
 
 static void make_piece(const struct step_gen *gen, struct stepper *s, double until, struct piece *p) {
-    *p = (struct piece){.begin = s->time, .linear = !s->config.formula, .still = true};
+    *p = (struct piece){.begin = s->time, .linear = !s->config.formula && !s->follows_bed, .still = true};
     p->smooth = p->linear && s->smooth_s > 0 && s->uses & USES_E;
     const unsigned axes = p->smooth ? s->uses & ~(unsigned)USES_E : s->uses;
-    double end = fmin(until, p->linear ? add_taps(gen, s, axes, p) : add_axes(gen, s, p));
+    const double border = p->linear        ? add_taps(gen, s, axes, p)
+                          : s->follows_bed ? add_seen_axes(gen, s, p)
+                                           : add_axes(gen, s, p);
+    double end = fmin(until, border);
     if (p->smooth) {
         double smooth[5];
         const double scale = s->config.weights[AXIS_E] / s->config.step_distance;
@@ -123,14 +174,70 @@ static void make_piece(const struct step_gen *gen, struct stepper *s, double unt
     p->seconds = fmax(end - s->time, ROUNDING_S / 2);
 }
 
+struct range {
+    double low, high;
+};
+
+// Of an axis between two times; it turns once at most.
+static struct range range_of(const double c[3], double from, double to) {
+    const double first = c[0] + from * (c[1] + from * c[2]), last = c[0] + to * (c[1] + to * c[2]);
+    struct range r = {fmin(first, last), fmax(first, last)};
+    const double turn = -c[1] / (2 * c[2]); // not finite in a cruise
+    if (turn > from && turn < to) {
+        const double at = c[0] + turn * (c[1] + turn * c[2]);
+        r = (struct range){fmin(r.low, at), fmax(r.high, at)};
+    }
+    return r;
+}
+
+static double fastest(const double c[3], double from, double to) {
+    return fmax(fabs(c[1] + 2 * c[2] * from), fabs(c[1] + 2 * c[2] * to));
+}
+
+// Where a linear stepper over a bed turns at most once behind FROM: it cannot turn at all before its speed is
+// used up by the most that the bed's bends and its axes can change it.
+static double bed_cut(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
+                      double from) {
+    const double to = p->seconds, *weights = s->config.weights;
+    const struct range x = range_of(p->axis[AXIS_X], from, to), y = range_of(p->axis[AXIS_Y], from, to),
+                       z = range_of(p->axis[AXIS_Z], from, to);
+    if (!step_surface_is_smooth(&gen->surface, x.low, x.high, y.low, y.high, z.low, z.high))
+        return from + SPAN_S;
+    double change =
+        fabs(weights[AXIS_Z]) * step_surface_bend(&gen->surface, fastest(p->axis[AXIS_X], from, to),
+                                                  fastest(p->axis[AXIS_Y], from, to),
+                                                  2 * fabs(p->axis[AXIS_X][2]), 2 * fabs(p->axis[AXIS_Y][2]));
+    for (int i = 0; i < AXES; i++)
+        change += 2 * fabs(weights[i] * p->axis[i][2]);
+    double speed;
+    evaluate(gen, s, p, from, &speed);
+    return from + fmax(SPAN_S, fabs(speed) * s->config.step_distance / change);
+}
+
+// Whether a linear stepper over a bed can reach no step in the piece, from where it was last evaluated:
+// mostly.
+static bool reaches_nothing(const struct step_gen *gen, const struct stepper *s, const struct piece *p) {
+    if (s->config.formula || p->still)
+        return false;
+    double far[3]; // mm, no further does an axis get from there
+    for (int i = 0; i < 3; i++)
+        far[i] = fabs(p->axis[i][0] - s->known_at[i]) + fastest(p->axis[i], 0, p->seconds) * p->seconds;
+    const double *weights = s->config.weights;
+    double most = fabs(weights[AXIS_Z]) * step_surface_change(&gen->surface, far);
+    for (int i = 0; i < 3; i++)
+        most += fabs(weights[i]) * far[i];
+    return fabs(s->known_off) + most / s->config.step_distance < 0.5 - 2.0 / STEP_SNAP;
+}
+
 // The first time after FROM behind which the stepper's speed may behave otherwise.
-static double next_cut(const struct piece *p, double from) {
+static double next_cut(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
+                       double from) {
     const double *c = p->poly;
     double cut = p->seconds;
     if (p->still)
         return cut;
     if (!p->linear)
-        return fmin(cut, from + SPAN_S);
+        return fmin(cut, s->config.formula ? from + SPAN_S : bed_cut(gen, s, p, from));
     if (!p->smooth) {
         const double turn = -c[1] / (2 * c[2]); // not finite in a cruise
         return turn > from + EXACT_S && turn < cut ? turn : cut;
@@ -146,17 +253,18 @@ static double next_cut(const struct piece *p, double from) {
 }
 
 // Where the speed changes its sign between FROM and TO, or TO.
-static double find_turn(const struct stepper *s, const struct piece *p, double from, double to) {
+static double find_turn(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
+                        double from, double to) {
     double first, last, speed, low = from, high = to;
-    evaluate(s, p, from, &first);
-    evaluate(s, p, to, &last);
+    evaluate(gen, s, p, from, &first);
+    evaluate(gen, s, p, to, &last);
     if (!(first * last < 0))
         return to;
     while (high - low > EXACT_S) {
         const double middle = 0.5 * (low + high);
         if (middle <= low || middle >= high)
             break;
-        evaluate(s, p, middle, &speed);
+        evaluate(gen, s, p, middle, &speed);
         if (speed * first > 0)
             low = middle;
         else
@@ -166,12 +274,12 @@ static double find_turn(const struct stepper *s, const struct piece *p, double f
 }
 
 // The time in FROM..TO at which the stepper, moving in DIRECTION, is at BOUNDARY; GUESS is any time.
-static double solve(const struct stepper *s, const struct piece *p, double from, double to, double guess,
-                    int direction, double boundary) {
+static double solve(const struct step_gen *gen, const struct stepper *s, const struct piece *p, double from,
+                    double to, double guess, int direction, double boundary) {
     double low = from, high = to, t = guess > low && guess < high ? guess : low;
     for (int i = 0; i < ITERATIONS && high - low > EXACT_S; i++) {
         double speed;
-        const double off = (evaluate(s, p, t, &speed) - boundary) * direction;
+        const double off = (evaluate(gen, s, p, t, &speed) - boundary) * direction;
         if (off > 0)
             high = t;
         else
@@ -223,12 +331,12 @@ static bool solve_block(const double c[5], double low, double high, double first
     return good;
 }
 
-static void solve_one_by_one(const struct stepper *s, const struct piece *p, double from, double to,
-                             int direction, int64_t position, int count, double *t) {
+static void solve_one_by_one(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
+                             double from, double to, int direction, int64_t position, int count, double *t) {
     double last = from, guess = from;
     for (int i = 0; i < count; i++) {
         const double boundary = (double)(position + (int64_t)i * direction) + 0.5 * direction;
-        t[i] = solve(s, p, last, to, guess, direction, boundary);
+        t[i] = solve(gen, s, p, last, to, guess, direction, boundary);
         guess = t[i] + (t[i] - last);
         last = t[i];
     }
@@ -248,7 +356,7 @@ static int play_solved(struct step_gen *gen, struct stepper *s, const struct pie
             const int n = count - i < FILL_BLOCK ? count - i : FILL_BLOCK;
             const int64_t position = s->position + (int64_t)i * direction;
             if (!p->linear || !solve_block(c, from, to, (double)(position * direction) + 0.5, n, t + i))
-                solve_one_by_one(s, p, from, to, direction, position, n, t + i);
+                solve_one_by_one(gen, s, p, from, to, direction, position, n, t + i);
             from = t[i + n - 1];
         }
         const int status = step_put(gen, s, &flow, direction, 0, 1, count);
@@ -260,7 +368,7 @@ static int play_solved(struct step_gen *gen, struct stepper *s, const struct pie
 
 static int play_span(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to) {
     double v0, v1;
-    const double begin = evaluate(s, p, from, &v0), end = evaluate(s, p, to, &v1);
+    const double begin = evaluate(gen, s, p, from, &v0), end = evaluate(gen, s, p, to, &v1);
     if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
         return step_fail(gen, STEP_BAD_MOVE, s, p->begin, end);
     const bool stands = p->still || fabs(end - begin) < NOISE_STEPS;
@@ -290,19 +398,29 @@ static int play_span(struct step_gen *gen, struct stepper *s, const struct piece
 
 static int play_piece(struct step_gen *gen, struct stepper *s, const struct piece *p) {
     double speed;
-    const double off = evaluate(s, p, 0, &speed) - (double)s->position;
+    if (s->follows_bed && reaches_nothing(gen, s, p))
+        return STEP_OK;
+    const double off = evaluate(gen, s, p, 0, &speed) - (double)s->position;
     if (s->time != s->checked && !(fabs(off) <= JUMP_STEPS))
         return step_fail(gen, STEP_JUMP, s, p->begin, off);
     s->checked = s->time;
+    if (s->follows_bed) {
+        for (int i = 0; i < 3; i++)
+            s->known_at[i] = p->axis[i][0];
+        s->known_off = off;
+        if (reaches_nothing(gen, s, p))
+            return STEP_OK;
+        s->known_off = HUGE_VAL; // it steps on
+    }
     for (double from = 0; from < p->seconds;) {
-        double to = next_cut(p, from);
+        double to = next_cut(gen, s, p, from);
         if (!p->still && (!p->linear || p->smooth))
-            to = find_turn(s, p, from, to);
+            to = find_turn(gen, s, p, from, to);
         const int status = play_span(gen, s, p, from, to);
         if (status)
             return status;
         if (s->config.formula && s->config.formula->unwraps)
-            s->angle = (evaluate(s, p, to, &speed) + s->origin) * s->config.step_distance;
+            s->angle = (evaluate(gen, s, p, to, &speed) + s->origin) * s->config.step_distance;
         from = to;
         s->time = s->checked = p->begin + to; // steps up to here are done, whatever comes
     }

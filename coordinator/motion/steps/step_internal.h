@@ -4,6 +4,7 @@
 #define MOTION_STEP_INTERNAL_H
 
 #include "coordinator/motion/steps/step_formula.h"
+#include "coordinator/motion/steps/step_surface.h"
 #include "coordinator/motion/steps/step_table.h"
 #include "coordinator/motion/steps/steps.h"
 
@@ -26,6 +27,7 @@ enum {
 // which hold before BORDER.
 struct seen {
     double time, border, poly[3];
+    double axis[3][3]; // X Y Z, mm: of a stepper over a bed, instead of POLY
     bool still;
 };
 
@@ -61,6 +63,8 @@ struct stepper {
 
     // A stepper whose steps are not those of one move after the other: see step_curve.c.
     bool curve;
+    bool follows_bed;               // its place depends on the shape of the bed
+    double known_at[3], known_off;  // X Y Z where that was last evaluated, and how far from its steps it was
     unsigned uses;                  // axes, a bit each
     double time, border;            // s: solved up to; to be solved up to
     double checked;                 // s, where it was last seen to be where it should; -1: nowhere
@@ -172,6 +176,7 @@ struct step_gen {
     struct axis_table tables[3];              // X Y Z; kept moves and REST include what they add
     double *table_values[3];                  // room for three columns of STEP_TABLE_POINTS each
     bool corrected;                           // a table acts
+    struct surface surface;                   // of the bed; added when steppers are evaluated
     struct shaper shapers[3];
     struct tap taps[STEP_TAPS];
     int tap_count;

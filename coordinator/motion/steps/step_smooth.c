@@ -38,8 +38,9 @@ static void look(const struct step_gen *gen, struct stepper *s, int which, doubl
         struct motion m;
         step_locate(gen, &s->cursor[STEP_TAPS + which], time + shift, &m);
         const double pa = m.pressure_advance, v = speed_of(&m, AXIS_E), a = accel_of(&m, AXIS_E);
-        *seen =
-            (struct seen){time, m.border - shift, {place_of(&m, AXIS_E) + pa * v, v + pa * a, a / 2}, false};
+        *seen = (struct seen){.time = time,
+                              .border = m.border - shift,
+                              .poly = {place_of(&m, AXIS_E) + pa * v, v + pa * a, a / 2}};
     }
     const double t = time - seen->time;
     poly[0] = seen->poly[0] + t * (seen->poly[1] + t * seen->poly[2]);

@@ -117,7 +117,7 @@ struct step_gen *step_gen_init(void *memory, const struct step_config *config) {
         s->config = config->steppers[i];
         struct node *node = &gen->nodes[s->config.node];
         s->clock = &node->clock;
-        s->origin = step_absolute(s, config->start);
+        s->origin = step_absolute(gen, s, config->start);
         if (!(fabs(s->origin) < 1e12))
             return NULL;
         step_set_tick_limits(s, config->max_error_s);

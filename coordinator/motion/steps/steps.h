@@ -21,6 +21,7 @@
 
 #include "coordinator/motion/trapezoid.h"
 
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
@@ -35,9 +36,10 @@ enum {
     STEP_MOVE_COUNT_MAX = 65535,
     STEP_SNAP = 65536,
     STEP_PARAMS = 8,
-    STEP_IMPULSES = 8,        // of one axis' shaper
-    STEP_TABLE_POINTS = 1024, // of one axis' table
-    STEP_SLACK_TICKS = 2,     // room for rounding that steps need beyond what the pulses need
+    STEP_IMPULSES = 8,         // of one axis' shaper
+    STEP_TABLE_POINTS = 1024,  // of one axis' table
+    STEP_SURFACE_POINTS = 256, // of a surface, along X and along Y
+    STEP_SLACK_TICKS = 2,      // room for rounding that steps need beyond what the pulses need
 };
 
 enum step_status {
@@ -88,6 +90,15 @@ struct step_correction {
     double offset, lag;      // mm: all of it; the part of it that will still fade
 };
 
+// The shape of a bed: see step_surface.h. Nodes in rows of X: height (mm), its slopes by X and by Y (mm/mm),
+// its twist (by both, 1/mm). FADE_FROM and FADE_TO are the infinite where nothing fades.
+struct step_surface {
+    int32_t points_x, points_y;            // 2..STEP_SURFACE_POINTS; points_x 0: no surface
+    double from_x, from_y, step_x, step_y; // mm
+    double fade_from, fade_to, fade_target;
+    const double *nodes; // 4 values each; must stay there until another surface is set
+};
+
 // What went wrong, for the sentence the user reads. Fields that do not apply are -1 or 0.
 struct step_error {
     int32_t status, stepper;
@@ -121,6 +132,16 @@ const struct step_formula *step_find_formula(const char *name);
 // Bytes that init needs, or 0 when CONFIG is not legal: counts within the limits above, node indices in
 // range, every length, frequency and error finite and > 0, ids in 32 bits, max_error at least one tick.
 size_t step_gen_size(const struct step_config *config);
+
+// Whether SURFACE can be a bed: counts and lengths in range, slopes and fading not steeper than 1/2.
+bool step_surface_is_legal(const struct step_surface *surface);
+
+// The slope that SURFACE has nowhere more of, mm/mm.
+double step_surface_steepest(const struct step_surface *surface);
+
+// Where Z has to be for the planned Z at X and Y, and the other way round.
+double step_surface_motor_z(const struct step_surface *surface, double x, double y, double z);
+double step_surface_planned_z(const struct step_surface *surface, double x, double y, double motor_z);
 
 // Prepares a generator in MEMORY of step_gen_size() bytes, aligned for a double. Node clocks begin as
 // ticks = print time · clock_freq.
@@ -164,6 +185,11 @@ int step_set_table(struct step_gen *gen, int axis, int n, const double *position
 int step_set_corrections(struct step_gen *gen, const double *offset, const int32_t *reverse);
 
 int step_get_correction(const struct step_gen *gen, int axis, struct step_correction *out);
+
+// Z follows the shape of a bed from now on, without a step: the axes then stand at the planned Z that *Z
+// gets. STEP_BAD_CONFIG: no legal surface (steeper than 1/2 counts as none), or a stepper that Z moves
+// follows E, too. STEP_NOT_IDLE unless all has settled.
+int step_set_surface(struct step_gen *gen, const struct step_surface *surface, double *z);
 
 // Axis X, Y or Z moves as the sum of its planned motion, moved later by time_s[i] and scaled by amplitude[i].
 // Amplitudes sum to 1, times are centred (sum of amplitude·time 0). STEP_NOT_IDLE unless all has settled.

@@ -6,21 +6,15 @@ from typing import Any
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps._steps import ffi, lib
+from coordinator.motion.steps.errors import StepError
+from coordinator.motion.steps.surface import Surface
 from nodes.support.c_structs import from_struct
-from nodes.support.errors import CanductorError
 
 MAX_ERROR_S = 12.5e-6
 """How far a step may be from its true time by default."""
 TABLE_POINTS_MAX = int(lib.STEP_TABLE_POINTS)
 """Points of one axis table that step generation has room for."""
 Position = tuple[float, float, float, float]
-
-
-class StepError(CanductorError):
-    """Step generation cannot go on; the sentence says where and why."""
-
-    print_time_s: float | None = None
-    """Of the step or move that cannot be; None: it is no matter of time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +230,22 @@ class StepGenerator:
         offsets = [correction.offset_mm for correction in corrections]
         if lib.step_set_corrections(self._gen, offsets, [int(c.reverse) for c in corrections]):
             raise StepError(f"corrections cannot become {offsets} mm while moves wait; generate them first")
+
+    def set_surface(self, surface: Surface | None) -> float:
+        """Let Z follow the shape of a bed from now on (None: a plane at 0): no steps.
+
+        Return the planned Z (mm) at which the axes stand from now on. Raises StepError unless the machine has
+        been at rest for the lag of all shapers and smoothing.
+        """
+        z = ffi.new("double *")
+        grid = ffi.new("struct step_surface *") if surface is None else surface.grid
+        status = lib.step_set_surface(self._gen, grid, z)
+        if status == lib.STEP_BAD_CONFIG:
+            both = next(s.name for s in self._steppers if s.weights[2] and s.weights[3])
+            raise StepError(f"the shape of the bed cannot be followed: {both} moves along both Z and E")
+        self._check_settled(status, "the shape of the bed", "")
+        self._surface = surface  # C reads its nodes
+        return float(z[0])
 
     @property
     def look_ahead_s(self) -> float:

@@ -37,7 +37,10 @@ def waiting(machine: MachineDescription) -> dict[str, tuple[tuple[str, ...], str
         "[board_pins a]\naliases:\n[board_pins b]\naliases: X_EN=PF3, Y_EN=\n",
         "[gcode_macro A]\ndescription:\ngcode:\n  G4\n",
         "[gcode_macro A]\ndescription: first\n  second\ngcode:\n  G4\n",
-        "[bed_mesh]\n[gcode_macro BED_MESH_CALIBRATE]\nrename_existing: _MESH\ngcode:\n  _MESH\n",
+        (
+            "[bed_mesh]\nmesh_min: 5, 5\nmesh_max: 90, 90\n"
+            "[gcode_macro BED_MESH_CALIBRATE]\nrename_existing: _MESH\ngcode:\n  _MESH\n"
+        ),
         "[gcode_macro G0]\nrename_existing: G00\ngcode:\n  G00 {rawparams}\n",
         "[gcode_macro M204]\nrename_existing: M204.0\ngcode:\n  M204.0 {rawparams}\n",
         "[dac084S085 stepper_digipot]\nenable_pin: PF4\n",
@@ -45,7 +48,9 @@ def waiting(machine: MachineDescription) -> dict[str, tuple[tuple[str, ...], str
         "[gcode_macro A]\ngcode:\n  {[1, 2]|random} {printer|string|pprint}\n",
         (
             "#*# <---------------------- SAVE_CONFIG ---------------------->\n#*# [bed_mesh default]\n"
-            "#*# version = 1\n#*# points =\n#*# \t  0.1, 0.2\n#*# \t  0.3, 0.4\n"
+            "#*# version = 1\n#*# points =\n#*# \t  0.1, 0.2, 0.3\n#*# \t  0.3, 0.4, 0.3\n#*# \t  0, 0, 0\n"
+            "#*# x_count = 3\n#*# y_count = 3\n#*# mesh_x_pps = 2\n#*# mesh_y_pps = 2\n#*# algo = lagrange\n"
+            "#*# tension = .2\n#*# min_x = 5\n#*# max_x = 90.5\n#*# min_y = 5\n#*# max_y = 90\n"
         ),
     ],
 )

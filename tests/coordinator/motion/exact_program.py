@@ -5,7 +5,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from coordinator.assembly.load import load_machine
-from coordinator.gcode.events import End, Full, PositionSet, ShaperChange, SmoothTimeChange, WeightsChange
+from coordinator.gcode.events import (
+    End,
+    Full,
+    PositionSet,
+    ShaperChange,
+    SmoothTimeChange,
+    SurfaceChange,
+    WeightsChange,
+)
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.modules.module_set import build_modules
@@ -101,7 +109,7 @@ def _run(pipeline: Pipeline) -> End:
         match event:
             case Full():
                 pipeline.run_through()
-            case PositionSet() | ShaperChange() | SmoothTimeChange() | WeightsChange():
+            case PositionSet() | ShaperChange() | SmoothTimeChange() | WeightsChange() | SurfaceChange():
                 pipeline.finish()
                 pipeline.act(event)
             case End():

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from coordinator.motion.specs import StepperSpec
+from coordinator.motion.steps.errors import StepError
 from coordinator.motion.steps.shapers import SHAPER_KINDS, shaper_impulses
-from coordinator.motion.steps.steps import StepError
 from tests.coordinator.motion.steps_harness import MAX_ERROR_S, NOISE_S, Run, node_spec, rows, stepper
 from tests.coordinator.motion.steps_oracle import LONG, Move, Position, make_move
 

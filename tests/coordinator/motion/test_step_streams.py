@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from coordinator.motion.specs import StepperSpec
-from coordinator.motion.steps.steps import StepError, StepGenerator
+from coordinator.motion.steps.errors import StepError
+from coordinator.motion.steps.steps import StepGenerator
 from tests.coordinator.motion.steps_harness import (
     MAX_ERROR_S,
     NOISE_S,

@@ -14,8 +14,9 @@ from coordinator.cli import main as cli
 from coordinator.config.model import AxisTablesDescription, MachineDescription
 from coordinator.ipc.server.state import StateTree
 from coordinator.modules.module_set import build_modules
+from coordinator.motion.steps.errors import StepError
 from coordinator.motion.steps.shapers import Impulses, shaper_impulses
-from coordinator.motion.steps.steps import TABLE_POINTS_MAX, StepError, StepGenerator
+from coordinator.motion.steps.steps import TABLE_POINTS_MAX, StepGenerator
 from coordinator.runtime.linux_host import LinuxHost
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.tables import TableService

@@ -379,8 +379,10 @@ def test_a_loop_that_is_busy_is_not_waited_for(tmp_path: Path) -> None:
 ASKS = """
 [bed_mesh]
 mesh_min: 10, 20.5
+mesh_max: 110, 120
 probe_count: 5
 faulty_region_1_min: 1, 2
+faulty_region_1_max: 3, 4
 [z_tilt_ng]
 points:
     50, 25
@@ -412,7 +414,7 @@ def test_asking_for_what_a_section_that_exists_does_not_tell_ends_nothing(tmp_pa
     machine = stage(tmp_path, ASKS + "[stepper_y]\ngear_ratio: 50:17, 3:1\n")
     told = machine.run("ASK")
     assert told[:6] == [
-        "[10, 20.5]|[5, 5]|[1, 2]",
+        "[10.0, 20.5]|[5, 5]|[1.0, 2.0]",
         "[[50, 25], [50, 225]]|PA0",
         "[]|[[50.0, 17.0], [3.0, 1.0]]",
         "{}|[0.0, 0.0]",

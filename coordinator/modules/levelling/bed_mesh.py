@@ -1,0 +1,346 @@
+"""[bed_mesh]: the bed is probed at many points, and Z follows its shape."""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from coordinator.config.errors import NotSupported
+from coordinator.config.options import SectionSpec
+from coordinator.gcode.builtins.machine import come_to_standstill
+from coordinator.gcode.commands import (
+    Call,
+    Immediate,
+    Phases,
+    ProgramAction,
+    ProgramContext,
+    Reading,
+)
+from coordinator.gcode.events import PositionSet, Reply, SurfaceChange
+from coordinator.gcode.parameters import bounded, flag, one, value
+from coordinator.gcode.parser import WordError, quoted
+from coordinator.modules.base import Build, Module, Modules
+from coordinator.modules.levelling.bed_mesh_options import (
+    BY_PROBE,
+    PARAMETERS,
+    PROFILE,
+    REGION,
+    SETTINGS,
+    UNSUPPORTED,
+    MeshSettings,
+    grid_for,
+    profile_name,
+    profile_texts,
+    read_profile,
+    read_settings,
+)
+from coordinator.modules.levelling.mesh import Grid, Mesh, Place, adapted, fitting_algorithm
+from coordinator.modules.levelling.points import ProbePoints
+from coordinator.modules.probes.probe import Measuring, Probe
+from coordinator.modules.programs.exclude_object import ExcludeObject
+from coordinator.runtime.module_context import ModuleContext
+from coordinator.support.values import Value
+from nodes.support.errors import CanductorError
+
+DEFAULT_PROFILE: Final = "default"
+
+
+class BedMeshSection(Module):
+    """The plain section has the settings, a named one is a profile."""
+
+    KIND = "bed_mesh"
+    SPEC = SectionSpec(
+        "Z follows the shape of the bed; [bed_mesh NAME] is a profile that was saved",
+        (*SETTINGS, *PROFILE),
+        unsupported=UNSUPPORTED,
+        family=REGION,
+    )
+    NAMED = True
+    NAMELESS = True
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.profile = build.reader.section.instance
+        mesh = build.shared(BedMesh)
+        if self.profile:
+            mesh.profiles[self.profile] = read_profile(build)
+        else:
+            mesh.set_up(read_settings(build), ProbePoints(build, by_probe=BY_PROBE))
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """What a calibration is to make."""
+
+    grid: Grid
+    algorithm: str
+    profile: str
+
+
+class BedMesh(Module):
+    """The commands, and the mesh that Z follows."""
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.name = "bed_mesh"
+        self.profiles: dict[str, Mesh] = {}
+        self._settings: MeshSettings | None = None
+        self._points: ProbePoints | None = None
+        self._place = build.place
+        self._limits = build.machine.limits
+        self._mesh: Mesh | None = None
+        self._fine: list[Value] = [[]]
+        self._profile = ""
+        self._offset: Place = (0.0, 0.0)
+        self._fade_offset = 0.0
+        self._probe: Probe | None = None
+        self._objects: ExcludeObject | None = None
+        for name, help_, read in (
+            ("BED_MESH_CALIBRATE", "Probe the bed and let Z follow its shape", self._read_calibrate),
+            ("BED_MESH_PROFILE", "LOAD, SAVE or REMOVE a profile by its name", self._read_profile),
+            ("BED_MESH_CLEAR", "Let Z follow no mesh", self._read_clear),
+            ("BED_MESH_OFFSET", "Look the mesh up X and Y further, its fade ZFADE higher", self._read_offset),
+            ("BED_MESH_OUTPUT", "Report the mesh, or with PGP=1 where it is probed", self._read_output),
+            ("BED_MESH_MAP", "Report the probed heights as JSON", self._read_map),
+            ("BED_MESH_CHECK", "Fail if the mesh exceeds MAX_DEVIATION or MAX_SLOPE", self._read_check),
+        ):
+            build.add_command(name, help_, read)
+
+    def set_up(self, settings: MeshSettings, points: ProbePoints) -> None:
+        """Take over what the plain section says."""
+        self._settings, self._points = settings, points
+
+    def link(self, modules: Modules) -> None:
+        """Find the probe; raises ConfigError."""
+        self._probe = next((modules.find(name, Probe) for name in modules.names(Probe)), None)
+        self._objects = modules.find("exclude_object", ExcludeObject)
+        if self._settings is not None and self._probe is None:
+            raise NotSupported(self._place, "it needs a probe that acts: [probe]")
+
+    def status(self) -> Mapping[str, Value]:
+        """Report the mesh that is followed, and all profiles, as front ends draw them."""
+        mesh = self._mesh
+        return {
+            "profile_name": self._profile,
+            "mesh_min": [0.0, 0.0] if mesh is None else [*mesh.minimum],
+            "mesh_max": [0.0, 0.0] if mesh is None else [*mesh.maximum],
+            "probed_matrix": [[]] if mesh is None else _rows(mesh.heights),
+            "mesh_matrix": [[]] if mesh is None else self._fine,
+            "profiles": {name: _told(profile) for name, profile in self.profiles.items()},
+        }
+
+    # ------------------------------------------------------------------------------------------- following
+
+    def take(self, job: ProgramContext, mesh: Mesh | None, profile: str = "") -> bool:
+        """Let Z follow MESH from here on; no motor moves. False: the planner has to be emptied first."""
+        if not come_to_standstill(job, job.machine.settle_s()):
+            return False
+        surface = None
+        if mesh is not None:
+            assert self._settings is not None
+            try:
+                surface = mesh.surface(self._settings.fade.of(mesh, self._fade_offset), self._offset)
+            except CanductorError as error:
+                raise WordError(str(error)) from None
+        planner = job.planner
+        motors = job.machine.motor_position(planner.toolhead_position)
+        job.machine.surface = surface
+        position = job.machine.planned_position(motors)
+        planner.set_position(position)
+        at_s = planner.print_time_end_s
+        job.emit(SurfaceChange(job.line, surface, at_s))
+        job.emit(PositionSet(job.line, "", position, at_s))
+        self._mesh, self._profile = mesh, profile
+        self._fine = [[]] if mesh is None else _rows(mesh.fine_heights())
+        if surface is not None:
+            fastest = self._limits.max_z_velocity / max(surface.steepest, 1e-9)
+            if fastest < planner.max_velocity:
+                job.emit(
+                    Reply(
+                        job.line,
+                        f"the mesh is up to {surface.steepest:.4f} mm per mm steep: moves faster than"
+                        f" {fastest:.0f} mm/s may move Z faster than max_z_velocity",
+                    )
+                )
+        return True
+
+    # ----------------------------------------------------------------------------------------- calibrating
+
+    def _read_calibrate(self, call: Call) -> Reading:
+        if self._settings is None:
+            raise WordError("BED_MESH_CALIBRATE needs the section [bed_mesh], which says where to probe")
+        assert self._probe is not None
+        command = call.command
+        how = self._probe.how(command)
+        given = command.only_parameters(PARAMETERS)
+        if given.get("METHOD", "automatic").lower() not in ("automatic", "scan", "rapid_scan"):
+            raise WordError(f"METHOD of {command.name} is {quoted(given['METHOD'])}; automatic is possible")
+        grid = grid_for(command, given, self._settings.grid)
+        if flag(command, given, "ADAPTIVE"):
+            margin = bounded(command, given, "ADAPTIVE_MARGIN", self._settings.margin, low=0, high=1000)
+            grid = adapted(grid, self._outlines(), margin)
+        try:
+            wanted = given.get("ALGORITHM", self._settings.algorithm).lower()
+            algorithm = fitting_algorithm(wanted, grid.counts)
+        except ValueError as error:
+            raise WordError(f"{command.name}: {error}") from None
+        profile = profile_name(command, given, "PROFILE") if "PROFILE" in given else DEFAULT_PROFILE
+        self._probe.check(call)
+        wanted_mesh = _Wanted(grid, algorithm, profile)
+        return Phases(lambda job: self._calibrate(job, call, how, wanted_mesh))
+
+    def _calibrate(
+        self, job: ProgramContext, call: Call, how: Measuring, wanted: "_Wanted"
+    ) -> Iterator[Reading]:
+        grid, profile = wanted.grid, wanted.profile
+        assert self._settings is not None
+        assert self._points is not None
+        assert self._probe is not None
+        yield ProgramAction(lambda job: self.take(job, None))
+        places, zero = grid.places(), self._settings.zero
+        if zero is not None and zero not in places:
+            places.append(zero)
+        measured = yield from self._points.measure(job, call.command, self._probe, how, places=places)
+        if measured is None:
+            return
+        height = {place: found.bed[2] for place, found in zip(places, measured, strict=True)}
+        try:
+            heights = grid.heights(height.__getitem__)
+        except ValueError as error:
+            raise WordError(f"{call.command.name}: {error}") from None
+        mesh = self._settings.mesh(grid, wanted.algorithm, heights - (0.0 if zero is None else height[zero]))
+        yield ProgramAction(lambda job: self.take(job, mesh, profile))
+        found = f"the bed is measured, from {heights.min():.3f} to {heights.max():.3f} mm"
+        kept = f"it is profile {profile}, which SAVE_CONFIG writes"
+        yield Immediate((f"{found}; {kept}",), lambda: self._keep(profile, mesh))
+
+    def _outlines(self) -> list[list[Place]]:
+        """Return the outlines of the objects that are printed."""
+        if self._objects is None:
+            raise WordError("ADAPTIVE needs [exclude_object], which knows where the objects are; add it")
+        return self._objects.outlines()
+
+    def _keep(self, name: str, mesh: Mesh) -> None:
+        self.profiles = {**self.profiles, name: mesh}
+        if (live := self._live) is not None:
+            live.soon_on_loop(lambda: _save(live, name, mesh))
+
+    # -------------------------------------------------------------------------------------- other commands
+
+    def _read_profile(self, call: Call) -> Reading:
+        given = call.parameters("LOAD", "SAVE", "REMOVE")
+        if len(given) != 1:
+            raise WordError("BED_MESH_PROFILE takes one of LOAD=name, SAVE=name and REMOVE=name")
+        if "LOAD" in given:
+            name = one(call.command, given, "LOAD", self.profiles)
+            if self._settings is None:
+                raise WordError("BED_MESH_PROFILE LOAD needs the section [bed_mesh]")
+            return ProgramAction(lambda job: self.take(job, self.profiles[name], name))
+        if "REMOVE" in given:
+            name = one(call.command, given, "REMOVE", self.profiles)
+            return Immediate(
+                (f"profile {name} is removed; SAVE_CONFIG removes it from the file",),
+                lambda: self._remove(name),
+            )
+        name, mesh = profile_name(call.command, given, "SAVE"), self._mesh
+        if mesh is None:
+            raise WordError("BED_MESH_PROFILE SAVE: no mesh is followed; probe one with BED_MESH_CALIBRATE")
+        return Immediate((f"profile {name} is saved; SAVE_CONFIG writes it",), lambda: self._keep(name, mesh))
+
+    def _remove(self, name: str) -> None:
+        self.profiles = {other: mesh for other, mesh in self.profiles.items() if other != name}
+        if (live := self._live) is not None:
+            live.soon_on_loop(lambda: live.remove_saved(f"bed_mesh {name}"))
+
+    def _read_clear(self, call: Call) -> Reading:
+        call.parameters()
+        return ProgramAction(lambda job: self._mesh is None or self.take(job, None))
+
+    def _read_offset(self, call: Call) -> Reading:
+        given = call.parameters("X", "Y", "ZFADE")
+        x, y, fade = (value(call.command, given, key, 0.0) for key in ("X", "Y", "ZFADE"))
+
+        def act(job: ProgramContext) -> bool:
+            before = (self._offset, self._fade_offset)
+            self._offset = (x if "X" in given else before[0][0], y if "Y" in given else before[0][1])
+            self._fade_offset = fade if "ZFADE" in given else before[1]
+            taken = self._mesh is None or self.take(job, self._mesh, self._profile)
+            if not taken:
+                self._offset, self._fade_offset = before
+            return taken
+
+        return ProgramAction(act)
+
+    def _read_output(self, call: Call) -> Reading:
+        given = call.parameters("PGP")
+        if flag(call.command, given, "PGP"):
+            if self._settings is None:
+                raise WordError("BED_MESH_OUTPUT PGP=1 needs the section [bed_mesh]")
+            places = self._settings.grid.places()
+            return Immediate(tuple(f"{n} | {x:.2f}, {y:.2f}" for n, (x, y) in enumerate(places)))
+        mesh = self._followed(call)
+        (x0, y0), (x1, y1) = mesh.minimum, mesh.maximum
+        title = (
+            f"profile {self._profile or '(none)'}, {mesh.algorithm}, X {x0:g} to {x1:g}, Y {y0:g} to {y1:g}"
+        )
+        rows = (" ".join(f"{height:9.6f}" for height in row) for row in mesh.heights)
+        return Immediate((f"{title}, heights in mm:", *rows))
+
+    def _read_map(self, call: Call) -> Reading:
+        call.parameters()
+        mesh = self._followed(call)
+        found = {"mesh_min": mesh.minimum, "mesh_max": mesh.maximum, "z_positions": _rows(mesh.heights)}
+        return Immediate((f"mesh_map_output {json.dumps(found)}",))
+
+    def _read_check(self, call: Call) -> Reading:
+        given = call.parameters("MAX_DEVIATION", "MAX_SLOPE")
+        mesh = self._followed(call)
+        found = {"MAX_DEVIATION": float(np.ptp(mesh.heights)), "MAX_SLOPE": _steepest(mesh)}
+        for key, text in (
+            ("MAX_DEVIATION", "mm from its lowest to its highest"),
+            ("MAX_SLOPE", "mm per mm steep"),
+        ):
+            most = value(call.command, given, key, np.inf)
+            if found[key] > most:
+                raise WordError(f"the mesh is {found[key]:.4f} {text}; {key} allows {most:g}")
+        return Immediate(("the mesh is within the limits",))
+
+    def _followed(self, call: Call) -> Mesh:
+        if self._mesh is None:
+            raise WordError(f"{call.command.name}: no mesh is followed; BED_MESH_CALIBRATE probes one")
+        return self._mesh
+
+
+def _save(live: ModuleContext, name: str, mesh: Mesh) -> None:
+    for option, text in profile_texts(mesh).items():
+        live.save(f"bed_mesh {name}", option, text)
+
+
+def _rows(heights: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[Value]:
+    return [[round(float(height), 6) for height in row] for row in heights]
+
+
+def _told(mesh: Mesh) -> dict[str, Value]:
+    return {
+        "points": _rows(mesh.heights),
+        "mesh_params": {
+            "min_x": mesh.minimum[0],
+            "max_x": mesh.maximum[0],
+            "min_y": mesh.minimum[1],
+            "max_y": mesh.maximum[1],
+            "x_count": mesh.counts[0],
+            "y_count": mesh.counts[1],
+            "mesh_x_pps": mesh.pps[0],
+            "mesh_y_pps": mesh.pps[1],
+            "algo": mesh.algorithm,
+            "tension": mesh.tension,
+        },
+    }
+
+
+def _steepest(mesh: Mesh) -> float:
+    """Return the greatest change between neighbouring points, mm per mm."""
+    across, along = (np.abs(np.diff(mesh.heights, axis=axis)).max() for axis in (1, 0))
+    return float(max(across / mesh.spacing[0], along / mesh.spacing[1]))
