@@ -354,6 +354,9 @@ class SimHost:
         """Open the port of a simulated line."""
         return self._open(self._ports[connection.path])
 
+    def usb_power(self) -> None:
+        """Return that nothing switches the power of the USB ports."""
+
     def _open(self, port: CanPort | UartPort) -> HostPort:
         def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
             return LinkIO.driven_by(port.open(), on_frame=on_frame, on_closed=on_closed)

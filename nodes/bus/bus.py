@@ -1,12 +1,14 @@
 """One bus or UART with its nodes: node ids, links, start and close with a clean unwind on failure."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from nodes.dictionary.cache import DictionaryCache
 from nodes.link import LinkSettings
 from nodes.link.interfaces import FrameLike, IoFactory, LinkInterface, LinkIoInterface, OnLost, OnResponses
+from nodes.node.absence import BACK_WITHIN_S, DEAF_S, RETRY_S, Absence
+from nodes.node.board_reset import ResetMethod, SerialPort, power_cycle, pulse, reset_methods
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeLost
 from nodes.node.node import Node, OnClock, OnState
@@ -71,7 +73,7 @@ class BusBase:
 
     async def _start(self) -> None:
         try:
-            self._open()
+            await self._open_at_start()
         except CanductorError as error:
             if len(self._may_be_absent) < len(self.nodes):
                 raise
@@ -81,6 +83,22 @@ class BusBase:
         async with asyncio.TaskGroup() as group:
             for node in self.nodes:
                 group.create_task(self._start_node(node))
+
+    async def _open_at_start(self) -> None:
+        """Open the bus; wait for its device when nodes are restarted, which may have made it disappear."""
+        restarted = [node.name for node in self.nodes if node.reset_first]
+        limit_s = BACK_WITHIN_S if restarted else 0.0
+        why = "a restart of its firmware was requested" if restarted else ""
+        absence = Absence(", ".join(restarted), limit_s, why, self._on_notice)
+        while True:
+            try:
+                self._open()
+            except CanductorError as error:
+                if not absence.goes_on(str(error)):
+                    raise absence.error(str(error), error) from None
+                await asyncio.sleep(RETRY_S)
+            else:
+                return
 
     async def _start_node(self, node: Node) -> None:
         try:
@@ -93,11 +111,14 @@ class BusBase:
     def ensure_open(self) -> None:
         """Reopen the bus if it closed, so that its nodes can be restarted; raises CanductorError."""
         if self.closed_because is not None:
-            io, self._io = self._io, None
-            if io is not None:
-                io.close()
+            self._close_io()
             self._open()
             self.closed_because = None
+
+    def _close_io(self) -> None:
+        io, self._io = self._io, None
+        if io is not None:
+            io.close()
 
     def _open(self) -> None:
         self._io = self._start_io(on_frame=self._frame_handler(), on_closed=self._io_closed)
@@ -106,9 +127,7 @@ class BusBase:
         """Close all nodes and the bus; nothing is left running."""
         for node in self.nodes:
             await node.close()
-        io, self._io = self._io, None
-        if io is not None:
-            io.close()
+        self._close_io()
 
     def emergency_stop(self) -> None:
         """Stop every node that can be reached."""
@@ -153,7 +172,10 @@ def _cause(error: BaseException) -> CanductorError | None:
 
 
 class UartBus(BusBase):
-    """A UART with its one node."""
+    """A UART with its one node. PORT: its device, for resets; None: the node is only reset by commands."""
+
+    port: SerialPort | None = None
+    restart_method = ResetMethod.COMMAND
 
     def add_node(
         self,
@@ -167,9 +189,37 @@ class UartBus(BusBase):
         """Add the node, before ``start``."""
         assert not self.nodes
         node = Node(
-            name, _UartConnector(self), build_config, on_state=on_state, on_clock=on_clock, cache=self._cache
+            name,
+            _UartConnector(self),
+            build_config,
+            on_state=on_state,
+            on_clock=on_clock,
+            on_notice=self._on_notice,
+            cache=self._cache,
         )
         return self._add(node, may_be_absent=may_be_absent)
+
+    def close_device(self) -> None:
+        """Close the device: a board on USB that is reset can get its name again only when nobody has it open."""
+        self._close_io()
+        if self.port is not None:
+            self.port.close()
+        self.closed_because = "its node was reset"
+
+    async def reset(self, method: ResetMethod) -> bool:
+        """Reset the board from outside; False when the device or the computer cannot do that."""
+        port = self.port
+        try:
+            if method is ResetMethod.RPI_USB and port is not None and port.set_power is not None:
+                self.close_device()
+                await power_cycle(port.set_power)
+                return True
+            if method is not ResetMethod.RPI_USB and port is not None and port.set_lines is not None:
+                await pulse(method, port.set_lines)
+                return True
+        except CanductorError as error:
+            self._on_notice(f"restart_method {method} failed: {error}")
+        return False
 
 
 class _UartConnector:
@@ -177,6 +227,7 @@ class _UartConnector:
         self._bus = bus
 
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
+        self._bus.ensure_open()
         return self._bus.io.open_link(
             LinkSettings(None, lost_after_s=self._bus.lost_after_s),
             on_responses=on_responses,
@@ -186,8 +237,23 @@ class _UartConnector:
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:  # noqa: ARG002
         return 0  # a device file does not show whether its baud rate is real (USB, pseudo-terminals)
 
+    @property
+    def reset_methods(self) -> Sequence[ResetMethod]:
+        return reset_methods(self._bus.restart_method)
+
+    async def reset(self, method: ResetMethod) -> bool:
+        return await self._bus.reset(method)
+
+    def absence_s(self) -> float:
+        return DEAF_S
+
+    def missing(self, error: CanductorError) -> str:
+        # Why the device cannot be opened is known; a device that is open has a board that does not answer.
+        opened = self._bus.closed_because is None
+        return f"nothing answers on {self._bus.name}" if opened else str(error)
+
     def forget(self) -> None:
-        pass
+        self._bus.close_device()
 
     def why_silent(self) -> CanductorError:
         return NodeLost(

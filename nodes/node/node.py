@@ -14,6 +14,8 @@ from nodes.dictionary.message_format import Message, Value
 from nodes.dictionary.parts import DictionaryError
 from nodes.dictionary.vocabulary import carries_identity, check_vocabulary
 from nodes.link.interfaces import LinkInterface
+from nodes.node.absence import BACK_WITHIN_S, RETRY_S, Absence
+from nodes.node.board_reset import ResetMethod
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.config import NodeConfig
 from nodes.node.connector import BuildConfig, Connector
@@ -26,11 +28,9 @@ from nodes.node.states import NodeEvent, NodeState, following
 from nodes.node.watchdog import NodeWatchdog, get_config, restarted
 from nodes.support.errors import CanductorError
 
-MAX_STARTS: Final = 3
-"""Most connections in one start: only a reset makes some nodes drop an old configuration."""
 CONFIG_RESET_TRIES: Final = 4
 RESET_SETTLE_S: Final = 0.3
-"""Time for the reset command to arrive, repeated if necessary, and for the node to boot again."""
+"""Time for the reset command to arrive, repeated if necessary, and for the node to begin to boot."""
 ALIVE_TIMEOUT_S: Final = 0.1
 """Time for a node to prove that it is alive when another board claims its identity."""
 CLOCK_TIMEOUT_S: Final = 15.0
@@ -50,8 +50,8 @@ class Node:
     """Node NAME, reached through CONNECTOR and configured as BUILD_CONFIG says.
 
     ON_STATE is called after every change of ``state``, ON_CLOCK with every new estimate of its clock, both on
-    the control loop. ``failure`` states why it is lost or shut down. Without a CACHE every start downloads
-    the dictionary.
+    the control loop; ON_NOTICE with a sentence for the user. ``failure`` states why it is lost or shut down.
+    Without a CACHE every start downloads the dictionary.
     """
 
     def __init__(
@@ -62,6 +62,7 @@ class Node:
         *,
         on_state: OnState = _ignore,
         on_clock: OnClock = _ignore,
+        on_notice: Callable[[str], None] = _ignore,
         cache: DictionaryCache | None = None,
     ) -> None:
         self.name = name
@@ -82,11 +83,13 @@ class Node:
         self._build_config = build_config
         self._on_state = on_state
         self._on_clock = on_clock
+        self._on_notice = on_notice
         self._cache = cache
         self._talk = RequestReply(name)
         self._keeper: ClockKeeper | None = None
         self._watchdog = NodeWatchdog(self._talk, 0)
         self._starting_over = True  # messages count only once an old configuration was checked
+        self._reaching = False  # a link that is lost now is one attempt that failed
         self._generation = 0
         for response, handler in (
             ("stats", self._stats_came),
@@ -231,22 +234,68 @@ class Node:
             raise
 
     async def _start(self) -> None:
-        for _ in range(MAX_STARTS):
-            self._starting_over = True
-            link = await self._connector.connect(self._talk.receive, self._link_lost(self._generation))
-            self._talk.attach(link)
-            self._enter(NodeEvent.CONNECTED)
-            await self._identify()
-            self._enter(NodeEvent.IDENTIFIED)
+        """Reach the node, reset it where that is needed, configure it: every start and restart is this."""
+        self._reaching = True
+        try:
+            keeper, wanted, found = await self._prepare()
+        finally:
+            self._reaching = False
+        self.reset_first = False
+        await self._configure(found, wanted)
+        await self._wait_for_clock(keeper)
+        self._enter(NodeEvent.CONFIGURED)
+
+    async def _prepare(self) -> tuple[ClockKeeper, NodeConfig, Message]:
+        """Return when the node is neither shut down nor differently configured, after resets if necessary.
+
+        Returns what keeps its clock, its configuration as it has to be, and its configuration state.
+        """
+        methods = list(self._connector.reset_methods)
+        used: list[ResetMethod] = []
+        absence = self._absence(self._connector.absence_s(), "")
+        if self.reset_first:
+            if methods[0] is not ResetMethod.COMMAND:  # reaches firmware that hangs, too
+                used += [methods[0]] * await self._connector.reset(methods.pop(0))
+            absence = self._absence(BACK_WITHIN_S, f"it was reset because {_REQUESTED}")
+        while True:
+            found = await self._reach(absence)
             keeper = self._start_clock()
-            if await self._configure(self._build_config(self.dictionary)):
-                await self._wait_for_clock(keeper)
-                self._enter(NodeEvent.CONFIGURED)
-                return
+            wanted = self._build_config(self.dictionary)
+            why = self._why_reset(found, wanted)
+            cleared = await self._clear(methods, used, why) if why else found
+            if cleared is not None:
+                return keeper, wanted, cleared
+            absence = self._absence(BACK_WITHIN_S, f"it was reset because {why}")
+
+    def _absence(self, limit_s: float, after: str) -> Absence:
+        return Absence(self.name, limit_s, after, self._on_notice)
+
+    async def _reach(self, absence: Absence) -> Message:
+        """Connect until the node has sent its dictionary, within ABSENCE; return its configuration state."""
+        while True:
+            try:
+                found = await self._reach_once()
+            except DictionaryError:
+                raise
+            except CanductorError as error:
+                missing = self._connector.missing(error)
+                if not absence.goes_on(missing):
+                    raise absence.error(missing, error) from None
+            else:
+                absence.ended()
+                return found
             await self._disconnect()
-            self._connector.forget()
-            self._enter(NodeEvent.RESET)
-        raise NodeError(f"node {self.name} keeps its configuration after {MAX_STARTS} resets; power-cycle it")
+            self._enter(NodeEvent.SILENT)
+            await asyncio.sleep(RETRY_S)
+
+    async def _reach_once(self) -> Message:
+        self._starting_over = True
+        link = await self._connector.connect(self._talk.receive, self._link_lost(self._generation))
+        self._talk.attach(link)
+        self._enter(NodeEvent.CONNECTED)
+        await self._identify()
+        self._enter(NodeEvent.IDENTIFIED)
+        return await get_config(self._talk)
 
     async def restart(self) -> None:
         """Start again, from READY, SHUTDOWN or LOST; raises like ``start``."""
@@ -311,17 +360,18 @@ class Node:
 
     # ------------------------------------------------------------------------------------------ configuring
 
-    async def _configure(self, wanted: NodeConfig) -> bool:
-        """Configure the node as WANTED; return False when it had to be reset and must be connected again."""
-        found = await get_config(self._talk)
-        other = bool(found.integer("is_config")) and found.integer("crc") != wanted.crc
-        reset_first, self.reset_first = self.reset_first, False
-        if other or reset_first or found.integer("is_shutdown"):
-            # Preferred to a reset of the whole board, which makes a USB device or CAN bridge disappear.
-            if "config_reset" not in self.dictionary.commands:
-                await self._reset()
-                return False
-            found = await self._config_reset()
+    def _why_reset(self, found: Message, wanted: NodeConfig) -> str:
+        """Return why the node cannot be configured as it is, as a clause; "": it can, or is already."""
+        if found.integer("is_shutdown"):
+            return "it was shut down"
+        if not found.integer("is_config"):
+            return ""
+        if found.integer("crc") != wanted.crc:
+            return "it had another configuration"
+        return _REQUESTED if self.reset_first else ""
+
+    async def _configure(self, found: Message, wanted: NodeConfig) -> None:
+        """Configure the node, whose state is FOUND, as WANTED."""
         self._starting_over = False
         if not found.integer("is_config"):
             for command in wanted.config_commands:
@@ -334,7 +384,6 @@ class Node:
         self._watchdog = NodeWatchdog(self._talk, wanted.crc)
         for command in wanted.init_commands:
             self._talk.send_text(command)
-        return True
 
     async def _finalized(self) -> Message:
         """Query the configuration state after its last command.
@@ -355,12 +404,35 @@ class Node:
         if not found.integer("is_config") or found.integer("crc") != wanted.crc:
             raise NodeError(f"node {self.name} did not accept its configuration; restart it and try again")
 
-    async def _reset(self) -> None:
+    async def _clear(
+        self, methods: list[ResetMethod], used: list[ResetMethod], why: str
+    ) -> Message | None:
+        """Clear the node's configuration by the first of METHODS that is possible; move it to USED.
+
+        Returns its configuration state; None: the board was reset and has to be connected again.
+        """
+        while methods:
+            method = methods.pop(0)
+            if method is ResetMethod.COMMAND and "config_reset" in self.dictionary.commands:
+                # Preferred to a reset of the whole board, which makes a USB device or CAN bridge disappear.
+                return await self._config_reset()
+            self._generation += 1  # the link is expected to break
+            by_command = method is ResetMethod.COMMAND
+            if await (self._reset_by_command() if by_command else self._connector.reset(method)):
+                used.append(method)
+                await self._disconnect()
+                self._enter(NodeEvent.RESET)
+                return None
+        found = f"resets had no effect (by {', '.join(used)})" if used else "it has no way to reset"
+        raise NodeError(f"node {self.name} has to be reset because {why}, but {found}; power-cycle it")
+
+    async def _reset_by_command(self) -> bool:
         if "reset" not in self.dictionary.commands:
-            raise NodeError(f"node {self.name} has another configuration and no way to reset; power-cycle it")
-        self._generation += 1  # the link is expected to break
+            return False
         self._talk.send("reset")
         await asyncio.sleep(RESET_SETTLE_S)
+        self._connector.forget()
+        return True
 
     async def _config_reset(self) -> Message:
         """Clear the node's configuration. Firmware accepts config_reset only when shut down."""
@@ -414,6 +486,9 @@ class Node:
             self._on_state(self)
 
     def _fail(self, event: NodeEvent, failure: NodeError) -> None:
+        if self._reaching and event in (NodeEvent.LOST, NodeEvent.RESTARTED):
+            self._talk.fail(failure)  # the start knows whether it may be away
+            return
         if following(self.state, event) is None:
             return
         self.failure = failure
@@ -448,4 +523,5 @@ class Node:
             self.restarted("it reported that")
 
 
+_REQUESTED: Final = "a restart of its firmware was requested"
 _SHUTDOWN_MEANS: Final = (NodeState.CONFIGURING, NodeState.READY)
