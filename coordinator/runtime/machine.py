@@ -358,7 +358,7 @@ class Machine:
     def _add_uart(self, node: NodeDescription, connection: UartConnection) -> None:
         wire = Wire(lambda: self.host.open_uart(connection), self.host.usb_power())
         bus = UartBus(connection.path, wire.start_io, cache=self._cache, on_notice=self._on_notice)
-        bus.port, bus.restart_method = wire, connection.restart_method
+        bus.resets_by(connection.restart_method, wire)
         self._open.append(_OpenBus(bus, wire, BusOverloadDetector(bus.name)))
         self._add(
             bus,

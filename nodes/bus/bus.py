@@ -5,13 +5,15 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from nodes.dictionary.cache import DictionaryCache
-from nodes.link import LinkSettings
+from nodes.link import LinkError, LinkSettings
 from nodes.link.interfaces import FrameLike, IoFactory, LinkInterface, LinkIoInterface, OnLost, OnResponses
 from nodes.node.absence import BACK_WITHIN_S, DEAF_S, RETRY_S, Absence
 from nodes.node.board_reset import ResetMethod, SerialPort, power_cycle, pulse, reset_methods
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeLost
 from nodes.node.node import Node, OnClock, OnState
+from nodes.node.request_reply import QueryTimeout
+from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
 
 LOST_AFTER_S: Final = 1.0
@@ -47,6 +49,7 @@ class BusBase:
         self.lost_after_s = lost_after_s
         self._may_be_absent: set[Node] = set()
         self._io: LinkIoInterface | None = None
+        self._outage_until_s = float("-inf")
 
     @property
     def io(self) -> LinkIoInterface:
@@ -83,6 +86,9 @@ class BusBase:
         async with asyncio.TaskGroup() as group:
             for node in self.nodes:
                 group.create_task(self._start_node(node))
+        for node in self.nodes:  # the bus may have closed when one that was ready already had no part in it
+            if node.state is NodeState.LOST and self.outage_s() > 0:
+                await self._start_node(node)
 
     async def _open_at_start(self) -> None:
         """Open the bus; wait for its device when nodes are restarted, which may have made it disappear."""
@@ -98,15 +104,35 @@ class BusBase:
                     raise absence.error(str(error), error) from None
                 await asyncio.sleep(RETRY_S)
             else:
+                absence.ended()
                 return
 
     async def _start_node(self, node: Node) -> None:
         try:
-            await node.start()
+            await self._bring_up(node)
             self._node_started(node)
         except CanductorError:
             if node not in self._may_be_absent:
                 raise
+
+    async def _bring_up(self, node: Node) -> None:
+        """Start the node; again if the bus closes because another node on it is being reset."""
+        while True:
+            try:
+                await (node.restart() if node.state is NodeState.LOST else node.start())
+            except (NodeLost, QueryTimeout, LinkError):
+                if self.outage_s() <= 0:
+                    raise
+            else:
+                return
+
+    def expect_outage(self) -> None:
+        """Record that a node is being reset, which may be the host's adapter to this bus."""
+        self._outage_until_s = asyncio.get_running_loop().time() + BACK_WITHIN_S
+
+    def outage_s(self) -> float:
+        """Return how long the bus may yet be closed because a node was reset, in s."""
+        return max(0.0, self._outage_until_s - asyncio.get_running_loop().time())
 
     def ensure_open(self) -> None:
         """Reopen the bus if it closed, so that its nodes can be restarted; raises CanductorError."""
@@ -172,10 +198,14 @@ def _cause(error: BaseException) -> CanductorError | None:
 
 
 class UartBus(BusBase):
-    """A UART with its one node. PORT: its device, for resets; None: the node is only reset by commands."""
+    """A UART with its one node, which is only reset by commands unless ``resets_by`` was called."""
 
-    port: SerialPort | None = None
+    _port: SerialPort | None = None
     restart_method = ResetMethod.COMMAND
+
+    def resets_by(self, method: ResetMethod, port: SerialPort) -> None:
+        """Have the node be reset by METHOD; PORT: its device."""
+        self.restart_method, self._port = method, port
 
     def add_node(
         self,
@@ -200,15 +230,15 @@ class UartBus(BusBase):
         return self._add(node, may_be_absent=may_be_absent)
 
     def close_device(self) -> None:
-        """Close the device: a board on USB that is reset can get its name again only when nobody has it open."""
+        """Close the device: only then can a board on USB that is reset get its name again."""
         self._close_io()
-        if self.port is not None:
-            self.port.close()
+        if self._port is not None:
+            self._port.close()
         self.closed_because = "its node was reset"
 
     async def reset(self, method: ResetMethod) -> bool:
         """Reset the board from outside; False when the device or the computer cannot do that."""
-        port = self.port
+        port = self._port
         try:
             if method is ResetMethod.RPI_USB and port is not None and port.set_power is not None:
                 self.close_device()
@@ -251,6 +281,9 @@ class _UartConnector:
         # Why the device cannot be opened is known; a device that is open has a board that does not answer.
         opened = self._bus.closed_because is None
         return f"nothing answers on {self._bus.name}" if opened else str(error)
+
+    def expect_reset(self) -> None:
+        pass
 
     def forget(self) -> None:
         self._bus.close_device()

@@ -247,15 +247,18 @@ class _CanConnector:
         return False
 
     def absence_s(self) -> float:
-        return 0.0
+        return self._bus.outage_s()
 
     def missing(self, error: CanductorError) -> str:
         assignment, self.assignment = self.assignment, None  # the next attempt asks for the id again
         if assignment is not None and self._uuid in assignment.in_bootloader:
-            return f"it waits in its boot loader (Katapult) on bus {self._bus.name}, as one without firmware does"
+            return f"it is in its boot loader (Katapult) on bus {self._bus.name}, its firmware not started"
         if assignment is not None and self._uuid in assignment.unheard:
             return f"its uuid {self._uuid} is not heard on bus {self._bus.name}"
         return str(error)
+
+    def expect_reset(self) -> None:
+        self._bus.expect_outage()
 
     def forget(self) -> None:
         self.assignment = None

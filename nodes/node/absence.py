@@ -68,7 +68,8 @@ class Absence:
         if not self.after_reset:
             return found
         return NodeLost(
-            f"node {self._name} did not come back within {self.limit_s:.0f} s: {self._after}, and now {missing}"
+            f"node {self._name} did not come back within {self.limit_s:.0f} s: {self._after}, and now "
+            f"{missing}"
         )
 
     def _passed_s(self) -> float:

@@ -84,7 +84,7 @@ async def pulse(method: ResetMethod, set_lines: SetLines) -> None:
 async def power_cycle(set_power: SetPower) -> None:
     """Switch the power of the USB ports off and on; raises CanductorError. It never stays off."""
     try:
-        set_power(False)  # noqa: FBT003
+        set_power(False)
         await asyncio.sleep(POWER_OFF_S)
     finally:
-        set_power(True)  # noqa: FBT003
+        set_power(True)

@@ -10,14 +10,24 @@ from nodes.node.config import NodeConfig
 from nodes.support.errors import CanductorError
 
 
-class Connector(Protocol):
+class ClockConnector(Protocol):
+    """What keeping a node's clock needs of its bus."""
+
+    def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
+        """Return the least time that a block takes on the wire; 0 where that is not known."""
+
+    def suspect(self) -> None:
+        """Check whether a silent node restarted; if it did, the bus notifies the node."""
+
+
+class Connector(ClockConnector, Protocol):
     """Interface through which a node gets its link; the bus provides it."""
 
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
         """Open a link: open the device again if it is closed, assign the node's id where it needs one."""
 
-    def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
-        """Return the least time that a block takes on the wire; 0 where that is not known."""
+    def expect_reset(self) -> None:
+        """Record that the node is about to reset itself, and that its bus may close then."""
 
     def forget(self) -> None:
         """Record that the node was reset: its id is gone, and on USB its device is about to disappear."""
@@ -40,9 +50,6 @@ class Connector(Protocol):
 
     def check_identity(self, found: bytes) -> None:
         """Raise when a board that answers get_canbus_id with FOUND is not the node."""
-
-    def suspect(self) -> None:
-        """Check whether a silent node restarted; if it did, the bus notifies the node."""
 
 
 BuildConfig = Callable[[Dictionary], NodeConfig]

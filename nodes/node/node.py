@@ -13,6 +13,7 @@ from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
 from nodes.dictionary.parts import DictionaryError
 from nodes.dictionary.vocabulary import carries_identity, check_vocabulary
+from nodes.link import LinkError
 from nodes.link.interfaces import LinkInterface
 from nodes.node.absence import BACK_WITHIN_S, RETRY_S, Absence
 from nodes.node.board_reset import ResetMethod
@@ -23,7 +24,7 @@ from nodes.node.errors import NodeError, NodeLost, NodeShutdown, shutdown_senten
 from nodes.node.identify import identify
 from nodes.node.load import NodeLoad, load_of
 from nodes.node.queue_slots import share_slots
-from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, RequestReply
+from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, QueryTimeout, RequestReply
 from nodes.node.states import NodeEvent, NodeState, following
 from nodes.node.watchdog import NodeWatchdog, get_config, restarted
 from nodes.support.errors import CanductorError
@@ -404,9 +405,7 @@ class Node:
         if not found.integer("is_config") or found.integer("crc") != wanted.crc:
             raise NodeError(f"node {self.name} did not accept its configuration; restart it and try again")
 
-    async def _clear(
-        self, methods: list[ResetMethod], used: list[ResetMethod], why: str
-    ) -> Message | None:
+    async def _clear(self, methods: list[ResetMethod], used: list[ResetMethod], why: str) -> Message | None:
         """Clear the node's configuration by the first of METHODS that is possible; move it to USED.
 
         Returns its configuration state; None: the board was reset and has to be connected again.
@@ -415,10 +414,15 @@ class Node:
             method = methods.pop(0)
             if method is ResetMethod.COMMAND and "config_reset" in self.dictionary.commands:
                 # Preferred to a reset of the whole board, which makes a USB device or CAN bridge disappear.
-                return await self._config_reset()
-            self._generation += 1  # the link is expected to break
-            by_command = method is ResetMethod.COMMAND
-            if await (self._reset_by_command() if by_command else self._connector.reset(method)):
+                with contextlib.suppress(NodeLost, QueryTimeout, LinkError):
+                    return await self._config_reset()
+                self._connector.forget()  # a Linux process starts again, and has another pseudo-terminal then
+                done = True
+            elif method is ResetMethod.COMMAND:
+                done = await self._reset_by_command()
+            else:
+                done = await self._connector.reset(method)
+            if done:
                 used.append(method)
                 await self._disconnect()
                 self._enter(NodeEvent.RESET)
@@ -429,6 +433,8 @@ class Node:
     async def _reset_by_command(self) -> bool:
         if "reset" not in self.dictionary.commands:
             return False
+        self._connector.expect_reset()
+        self._generation += 1  # the link is expected to break
         self._talk.send("reset")
         await asyncio.sleep(RESET_SETTLE_S)
         self._connector.forget()

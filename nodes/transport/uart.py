@@ -67,7 +67,7 @@ class UartTransport:
             return False
         return True
 
-    def set_lines(self, dtr: bool, rts: bool) -> None:  # noqa: FBT001
+    def set_lines(self, dtr: bool, rts: bool) -> None:
         """Set DTR and RTS; raises CanductorError. The link's thread may use the device meanwhile."""
         try:
             for level, line in ((dtr, termios.TIOCM_DTR), (rts, termios.TIOCM_RTS)):

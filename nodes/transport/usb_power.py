@@ -18,14 +18,14 @@ def usb_power_switch(platform: Path = PLATFORM) -> Callable[[bool], None] | None
     if not files:
         return None
 
-    def switch(on: bool) -> None:  # noqa: FBT001
+    def switch(on: bool) -> None:
         for file in files:
             try:
                 file.write_text("1" if on else "0")
             except OSError as error:
                 raise CanductorError(
-                    f"cannot switch the power of the USB ports by {file}: {error.strerror}; run as a user who "
-                    "may write it, or set another restart_method"
+                    f"cannot switch the power of the USB ports by {file}: {error.strerror}; run as a user "
+                    "who may write it, or set another restart_method"
                 ) from None
 
     return switch

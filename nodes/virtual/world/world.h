@@ -111,6 +111,9 @@ void world_node_power_off(struct world_node *node);
 void world_node_power_on(struct world_node *node, uint64_t start_clock);
 // From now on the clock runs PPM above nominal, rising by PPM_PER_S.
 int world_node_set_rate(struct world_node *node, double ppm, double ppm_per_s);
+// The host's PORT is a USB device on this board: it disappears when the board is reset or loses its power,
+// and comes back GONE_NS after the reset or the power.
+void world_node_carries(struct world_node *node, struct world_port *port, uint64_t gone_ns);
 double world_node_ppm(const struct world_node *node);
 uint64_t world_node_clock(const struct world_node *node);
 // The instants at which the clock became CLOCKS (64 bits, of the present life), in ps.
@@ -167,7 +170,9 @@ struct world_port *world_add_uart_port(struct world *world, struct world_uart *u
 struct world_port_settings *world_port_settings(struct world_port *port);
 struct can_controller *world_port_controller(struct world_port *port);
 void world_port_counters(const struct world_port *port, struct world_port_counters *out);
-// Starts a bus on the port, ends it. NULL: no memory, or there is one.
+// Whether the device is there.
+int world_port_there(const struct world_port *port);
+// Starts a bus on the port, ends it. NULL: no memory, there is one, or no device.
 struct io_bus *world_port_open(struct world_port *port, const struct io_settings *settings);
 void world_port_close(struct world_port *port);
 // The adapter is pulled out: the bus ends with CAUSE (an errno, 0: end of file).

@@ -170,7 +170,9 @@ def test_another_configuration_or_a_shutdown_is_reset(source: dict[str, Any], sh
 def test_a_node_that_cannot_be_reset_is_said_to_need_power() -> None:
     twin = TwinNode(source=without_commands("config_reset", "reset"), configured=True, crc=1)
     machine = Machine(twin)
-    with pytest.raises(NodeError, match="because it had another configuration, but it has no way to reset; power-cycle it"):
+    with pytest.raises(
+        NodeError, match="because it had another configuration, but it has no way to reset; power-cycle it"
+    ):
         machine.run(machine.bus.start)
 
 
@@ -180,7 +182,9 @@ def test_a_node_that_keeps_its_old_configuration_is_given_up() -> None:
             pass
 
     machine = Machine(Stubborn(source=without_commands("config_reset"), configured=True, crc=1))
-    with pytest.raises(NodeError, match=r"another configuration, but resets had no effect \(by command\); power"):
+    with pytest.raises(
+        NodeError, match=r"another configuration, but resets had no effect \(by command\); power"
+    ):
         machine.run(machine.bus.start)
 
 
