@@ -78,7 +78,7 @@ def test_a_linux_process(tmp_path: Path) -> None:
 
 
 def check_exact(service: ForeignService, firmware: LinuxProcess) -> None:
-    """Home and move: the pins made exactly the steps that were sent, and the axes are where they should be."""
+    """Home and move: the pins made exactly the steps that were sent."""
     service.run(AT_HOME)
     service.step_counts()
     x, y, z = firmware.positions()[:3]
