@@ -126,4 +126,5 @@ def test_an_atmega2560(tmp_path: Path, board: dict[str, Any]) -> None:
             service.until("shutdown")
         edit(config, "PB6")
         with foreign_service(config) as service:
-            assert service.step_counts()["stepper_x"] == 0
+            position = service.client.call("position.get", {"ask_nodes": True})
+            assert position["nodes_steps"] == {"stepper_x": 0, "stepper_y": 0, "stepper_z": 0}
