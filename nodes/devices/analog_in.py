@@ -16,6 +16,8 @@ SAMPLES: Final = 8
 SAMPLE_S: Final = 1e-3
 SUM_LIMIT: Final = 0xFFFF
 """Sums of samples have 16 bits on the wire."""
+OUT_OF_RANGE: Final = "ADC out of range"
+"""The reason with which a node shuts down then; it does not name the sensor."""
 RANGE_CHECKS: Final = 4
 """So many sums in a row have to be out of range: the node then shuts down."""
 
@@ -56,6 +58,9 @@ class AnalogIn:
         self.on_value: Callable[[AnalogValue], None] = _ignore
         """Called on the control loop with every measurement."""
         self.report_s = report_s
+        self.describe: Callable[[float], str] = self._percent
+        """Returns a ratio that is out of range in the user's words."""
+        self._outside: float | None = None
         self._pin = pin
         self._low, self._high = low, high
         self._range_checks = range_checks
@@ -95,6 +100,8 @@ class AnalogIn:
         if self._unlisten is not None:
             self._unlisten()
         self._unlisten = node.on("analog_in_state", self._oid, self._came)
+        self._outside = None
+        node.explain_shutdown(self._explain)
         clock = start_clock(node) % 2**32
         node.send("query_analog_in", oid=self._oid, clock=clock, **self._times, **self._limits)
 
@@ -102,6 +109,15 @@ class AnalogIn:
         """Measure no more."""
         times = {**self._times, "sample_count": 0}
         node.send("query_analog_in", oid=self._oid, clock=0, **times, **self._limits)
+
+    def _explain(self, reason: str) -> str:
+        """Return that this is the sensor that was out of range, by its last measurement."""
+        if reason != OUT_OF_RANGE or self._outside is None:
+            return ""
+        return f"{self.name}: {self.describe(self._outside)}"
+
+    def _percent(self, ratio: float) -> str:
+        return f"{ratio:.1%} of the converter's range, allowed are {self._low:.1%} to {self._high:.1%}"
 
     def _came(self, message: Message) -> None:
         if "values" in message.params:
@@ -112,6 +128,8 @@ class AnalogIn:
         next_clock = message.integer("next_clock")
         rest_ticks = self._times["rest_ticks"]
         for index, value in enumerate(sums):
+            ratio = value / self._full
+            self._outside = None if self._low <= ratio <= self._high else ratio
             began = next_clock - (len(sums) - index) * rest_ticks
             self.on_value(AnalogValue(min(value / self._full, 1.0), began % 2**32))
 

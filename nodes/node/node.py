@@ -40,6 +40,8 @@ CLOCK_TIMEOUT_S: Final = 15.0
 
 ClockSource = Literal["pulse", "exchange"]
 OnState = Callable[["Node"], None]
+ExplainShutdown = Callable[[str], str]
+"""Returns what is known of a shutdown for the given reason, in a few words; "": nothing."""
 OnClock = Callable[["Node", ClockEstimate], None]
 
 
@@ -89,6 +91,7 @@ class Node:
         self._talk = RequestReply(name)
         self._keeper: ClockKeeper | None = None
         self._watchdog = NodeWatchdog(self._talk, 0)
+        self._explain: list[ExplainShutdown] = []
         self._starting_over = True  # messages count only once an old configuration was checked
         self._reaching = False  # a link that is lost now is one attempt that failed
         self._generation = 0
@@ -188,6 +191,10 @@ class Node:
     def on(self, response: str, oid: int | None, callback: Callback) -> Callable[[], None]:
         """Call CALLBACK for every RESPONSE (of OID, unless None); return a function that ends it."""
         return self._talk.on(response, oid, callback)
+
+    def explain_shutdown(self, explain: ExplainShutdown) -> None:
+        """Have EXPLAIN add to the sentence of a shutdown, until the node is started again."""
+        self._explain.append(explain)
 
     def emergency_stop(self) -> None:
         """Stop the node ahead of everything queued for it; no effect on a node that cannot be reached."""
@@ -291,6 +298,7 @@ class Node:
 
     async def _reach_once(self) -> Message:
         self._starting_over = True
+        self._explain.clear()
         link = await self._connector.connect(self._talk.receive, self._link_lost(self._generation))
         self._talk.attach(link)
         self._enter(NodeEvent.CONNECTED)
@@ -522,7 +530,9 @@ class Node:
         if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:
             return
         text = self.dictionary.enum_name("static_string_id", static_string_id)
-        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(shutdown_sentence(self.name, text)))
+        known = [words for explain in self._explain if (words := explain(text))]
+        sentence = shutdown_sentence(self.name, text) + (f" ({'; '.join(known)})" if known else "")
+        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(sentence))
 
     def _starting_came(self, _: Message) -> None:
         if not self._starting_over:

@@ -35,7 +35,9 @@ def test_the_first_and_the_last_address(order: int) -> None:
         assert Host().dies(f"debug_write order={order} addr={addr} val=1") == "Debug address not accessible"
 
 
-@pytest.mark.parametrize(("order", "addr"), [(1, BASE + 1), (2, BASE + 1), (2, BASE + 2), (3, BASE), (255, BASE)])
+@pytest.mark.parametrize(
+    ("order", "addr"), [(1, BASE + 1), (2, BASE + 1), (2, BASE + 2), (3, BASE), (255, BASE)]
+)
 def test_addresses_that_are_not_aligned_and_other_widths(order: int, addr: int) -> None:
     assert Host().dies(f"debug_read order={order} addr={addr}") == "Debug address not accessible"
     assert Host().dies(f"debug_write order={order} addr={addr} val=1") == "Debug address not accessible"
