@@ -262,8 +262,11 @@ class Node:
         used: list[ResetMethod] = []
         absence = self._absence(self._connector.absence_s(), "")
         if self.reset_first:
-            if methods[0] is not ResetMethod.COMMAND:  # reaches firmware that hangs, too
-                used += [methods[0]] * await self._connector.reset(methods.pop(0))
+            from_outside = [method for method in methods if method is not ResetMethod.COMMAND]
+            for method in from_outside:  # reaches firmware that hangs, too
+                methods.remove(method)
+                if await self._connector.reset(method):
+                    used.append(method)
             absence = self._absence(BACK_WITHIN_S, f"it was reset because {_REQUESTED}")
         while True:
             found = await self._reach(absence)

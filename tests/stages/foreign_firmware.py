@@ -28,9 +28,9 @@ ATMEGA2560: Final = SHARED / "data" / "firmware" / "klipper-atmega2560.hex"
 AVR_BOARD: Final = Path(__file__).parent / "avr_board.c"
 
 NEAR_HOME: Final = """\
-axis X 1 2 0 0 3 0 1 0 800
-axis Y 4 5 1 0 6 0 1 0 800
-axis Z 7 8 0 0 9 -320 1 1 400
+axis X 1 2 0 0 3 0 1 0 80
+axis Y 4 5 1 0 6 0 1 0 80
+axis Z 7 8 0 0 9 -320 1 1 0
 axis E 10 11 0 0 -1 0 1 0 0
 heater bed 20 0 3.0 0.01
 heater hot 21 1 6.0 0.015
