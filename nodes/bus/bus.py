@@ -7,7 +7,7 @@ from typing import Final
 from nodes.dictionary.cache import DictionaryCache
 from nodes.link import LinkError, LinkSettings
 from nodes.link.interfaces import FrameLike, IoFactory, LinkInterface, LinkIoInterface, OnLost, OnResponses
-from nodes.node.absence import BACK_WITHIN_S, DEAF_S, RETRY_S, Absence
+from nodes.node.absence import BACK_WITHIN_S, DEAF_S, REQUESTED, RETRY_S, Absence
 from nodes.node.board_reset import ResetMethod, SerialPort, power_cycle, pulse, reset_methods
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeLost
@@ -94,7 +94,7 @@ class BusBase:
         """Open the bus; wait for its device when nodes are restarted, which may have made it disappear."""
         restarted = [node.name for node in self.nodes if node.reset_first]
         limit_s = BACK_WITHIN_S if restarted else 0.0
-        why = "a restart of its firmware was requested" if restarted else ""
+        why = REQUESTED if restarted else ""
         absence = Absence(", ".join(restarted), limit_s, why, self._on_notice)
         while True:
             try:

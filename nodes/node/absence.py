@@ -21,6 +21,8 @@ RETRY_S: Final = 0.1
 FIRST_NOTICE_S: Final = 1.0
 """Shorter absences are not mentioned."""
 NOTICE_INTERVAL_S: Final = 3.0
+REQUESTED: Final = "a restart of its firmware was requested"
+"""Why a node is reset that is configured as it should be."""
 
 
 class Absence:

@@ -15,7 +15,7 @@ from nodes.dictionary.parts import DictionaryError
 from nodes.dictionary.vocabulary import carries_identity, check_vocabulary
 from nodes.link import LinkError
 from nodes.link.interfaces import LinkInterface
-from nodes.node.absence import BACK_WITHIN_S, RETRY_S, Absence
+from nodes.node.absence import BACK_WITHIN_S, REQUESTED, RETRY_S, Absence
 from nodes.node.board_reset import ResetMethod
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.config import NodeConfig
@@ -267,7 +267,8 @@ class Node:
                 methods.remove(method)
                 if await self._connector.reset(method):
                     used.append(method)
-            absence = self._absence(BACK_WITHIN_S, f"it was reset because {_REQUESTED}")
+            after = f"it was reset because {REQUESTED}" if used else REQUESTED
+            absence = self._absence(BACK_WITHIN_S, after)
         while True:
             found = await self._reach(absence)
             keeper = self._start_clock()
@@ -380,7 +381,7 @@ class Node:
             return ""
         if found.integer("crc") != wanted.crc:
             return "it had another configuration"
-        return _REQUESTED if self.reset_first else ""
+        return REQUESTED if self.reset_first else ""
 
     async def _configure(self, found: Message, wanted: NodeConfig) -> None:
         """Configure the node, whose state is FOUND, as WANTED."""
@@ -542,5 +543,4 @@ class Node:
             self.restarted("it reported that")
 
 
-_REQUESTED: Final = "a restart of its firmware was requested"
 _SHUTDOWN_MEANS: Final = (NodeState.CONFIGURING, NodeState.READY)

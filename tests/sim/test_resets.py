@@ -160,6 +160,32 @@ def test_a_device_that_is_away_when_the_firmware_is_restarted_is_waited_for(tmp_
     machine.serve(replug)
 
 
+def test_a_node_of_policy_pause_comes_back_by_the_same_start(tmp_path: Path) -> None:
+    """It restarts by itself, then shuts down: only then it has to be reset."""
+    sections = "[mcu light]\nserial: /dev/light\npolicy: pause\n[output_pin lamp]\npin: light:PA1\n"
+    machine = DemoMachine(
+        tmp_path,
+        nodes=ONLY_RESET | {"light": NodeSetting(config_reset="unknown")},
+        buses=USB | {"/dev/light": BusSetting(usb_of="light", usb_gone_s=Range(2, 2))},
+        sections=sections,
+    )
+    light = machine.node("light")
+
+    async def lose(stage: Served) -> None:
+        for times in (1, 2):
+            light.reset()
+            await stage.until(lambda: stage.tree.get("nodes.light.state") == "lost", "the loss")
+            await stage.until(lambda: stage.tree.get("nodes.light.state") == "ready", "the return")
+            assert light.counters()["resets"] == times, "it was not configured: nothing to reset"
+        assert sum("node light is back after" in line for line in stage.lines) == 2
+        await stage.call("node.command", node="light", command="emergency_stop")
+        await stage.until(lambda: light.counters()["resets"] == 3, "its reset")
+        await stage.until(lambda: stage.tree.get("nodes.light.state") == "ready", "the return")
+        assert str(stage.service.state) == "ready"
+
+    machine.serve(lose, node_commands=True)
+
+
 def test_a_board_that_does_not_come_back_is_reported_as_that(tmp_path: Path) -> None:
     buses = {DEVICE: BusSetting(usb_of="zboard", usb_gone_s=Range(60, 60))}
     machine = DemoMachine(tmp_path, nodes=ONLY_RESET, buses=buses)

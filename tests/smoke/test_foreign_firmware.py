@@ -70,11 +70,10 @@ def test_a_linux_process(tmp_path: Path) -> None:
             edit(config, "gpiochip0/gpio30")
             service.restart(firmware=False)
             check_exact(service, firmware)
-        edit(config, "gpiochip0/gpio31")
-        with foreign_service(config) as service:  # the first run after an edit
             service.client.call("machine.emergency_stop")
             service.until("shutdown")
-        with foreign_service(config):  # the first run after a shutdown
+        edit(config, "gpiochip0/gpio31")
+        with foreign_service(config):  # the first run after a shutdown and an edit
             pass
 
 
