@@ -3,7 +3,7 @@
 
 LINTED_C := $(filter %.c,$(filter firmware/% nodes/% coordinator/% bench/%,$(C_SOURCES)))
 # What the sanitizers' headers or a build's constants are needed for is compiled by its own makefile or test.
-CLANG_C := $(filter-out tests/fuzz/driver.c tests/firmware/held_read.c tests/mutation/hits.c,$(filter %.c,$(C_SOURCES)))
+CLANG_C := $(filter-out tests/stages/avr_board.c tests/fuzz/driver.c tests/firmware/held_read.c tests/mutation/hits.c,$(filter %.c,$(C_SOURCES)))
 
 # All C with clang, where there is one: it sees other things than gcc.
 clang-c:

@@ -82,7 +82,6 @@ _KINDS: Final[Mapping[str, str]] = {
 _OPTIONS: Final[Mapping[str, str]] = {
     "enable_pin": "the motor cannot be switched on, and an axis that it moves is refused by G28",
     "endstop_pin": "an axis that has no other endstop is refused by G28",
-    "restart_method": "the node is reset by its own commands",
     "max_angular_velocity": "near the middle the bed may be asked to turn faster",
     "homing_current": "the motor homes with run_current",
 }

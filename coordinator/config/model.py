@@ -12,6 +12,7 @@ from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
 from coordinator.kinematics.dual_carriage import DualCarriage
 from coordinator.kinematics.extruder import ExtruderMotion
 from coordinator.motion.specs import MotionLimits
+from nodes.node.board_reset import ResetMethod
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +32,7 @@ class UartConnection:
 
     path: str
     baud: int
-    restart_method: str
-    """arduino, cheetah, rpi_usb or command."""
+    restart_method: ResetMethod
     place: Place
 
 

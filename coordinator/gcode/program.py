@@ -3,7 +3,7 @@
 import os
 import select
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
@@ -59,6 +59,10 @@ class _Typed:
         """Leave standard input open."""
 
 
+def _ignore(_piece: bytes, _place: int) -> None:
+    pass
+
+
 class Program:
     """A program with a window on its text: ``data[start:]`` is what was not consumed yet.
 
@@ -79,6 +83,8 @@ class Program:
         """Whether the window reaches the end of the program."""
         self.end_bytes: int | None = None
         """Where reading ends, if before the end of the file."""
+        self.on_piece: Callable[[bytes, int], None] = _ignore
+        """Called with each piece that is read and its place, in the thread that reads."""
         self._source = source
         self._read_bytes = 0
 
@@ -132,6 +138,7 @@ class Program:
             self.final = False
         else:
             self.final = not piece
+        self.on_piece(piece, self._read_bytes)
         self._read_bytes += len(piece)
         self.data = self.data[self.start :] + piece
         self.start = 0

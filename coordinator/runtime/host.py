@@ -11,6 +11,7 @@ from typing import Protocol
 from coordinator.config.model import CanConnection, UartConnection
 from nodes.clock.clock import HostTime
 from nodes.link.interfaces import IoFactory
+from nodes.node.board_reset import SetLines, SetPower
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +23,8 @@ class Port:
     start_io: IoFactory
     close: Callable[[], None]
     """Let go of the device, after its I/O has ended."""
+    set_lines: SetLines | None = None
+    """Set DTR and RTS of a serial line, also while its I/O runs; None: it has none, as a pseudo-terminal."""
 
 
 class Host(Protocol):
@@ -37,6 +40,10 @@ class Host(Protocol):
 
     def open_uart(self, connection: UartConnection) -> Port:
         """Open a UART; raises CanductorError."""
+        ...
+
+    def usb_power(self) -> SetPower | None:
+        """Return what switches the power of the USB ports; None: the computer cannot do that."""
         ...
 
 

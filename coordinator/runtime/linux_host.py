@@ -8,7 +8,9 @@ from coordinator.runtime.host import Port
 from nodes.clock.clock import HostTime
 from nodes.link import LinkIO
 from nodes.link.interfaces import LinkIoInterface, OnFrame, OnLost
+from nodes.node.board_reset import SetLines, SetPower
 from nodes.transport import ByteTransport, CanTransport, open_can, open_uart
+from nodes.transport.usb_power import usb_power_switch
 
 
 class LinuxHost:
@@ -28,11 +30,16 @@ class LinuxHost:
 
     def open_uart(self, connection: UartConnection) -> Port:
         """Open a device file."""
-        return _port(open_uart(connection.path, connection.baud))
+        uart = open_uart(connection.path, connection.baud)
+        return _port(uart, uart.set_lines if uart.has_lines else None)
+
+    def usb_power(self) -> SetPower | None:
+        """Return the switch that Raspberry Pi computers have."""
+        return usb_power_switch()
 
 
-def _port(transport: CanTransport | ByteTransport) -> Port:
+def _port(transport: CanTransport | ByteTransport, set_lines: SetLines | None = None) -> Port:
     def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
         return LinkIO(transport, asyncio.get_running_loop(), on_frame=on_frame, on_closed=on_closed)
 
-    return Port(transport.name, start, transport.close)
+    return Port(transport.name, start, transport.close, set_lines)

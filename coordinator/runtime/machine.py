@@ -222,8 +222,6 @@ class Machine:
         node = self._node(name)
         self._waking.add(node)
         try:
-            if node.state is NodeState.SLEEPING:
-                self._bus_of[node].ensure_open()
             await node.wake()
         except CanductorError:
             if node.state in (NodeState.LOST, NodeState.SHUTDOWN):
@@ -359,8 +357,9 @@ class Machine:
         return bus
 
     def _add_uart(self, node: NodeDescription, connection: UartConnection) -> None:
-        wire = Wire(lambda: self.host.open_uart(connection))
+        wire = Wire(lambda: self.host.open_uart(connection), self.host.usb_power())
         bus = UartBus(connection.path, wire.start_io, cache=self._cache, on_notice=self._on_notice)
+        bus.resets_by(connection.restart_method, wire)
         self._open.append(_OpenBus(bus, wire, BusOverloadDetector(bus.name)))
         self._add(
             bus,
@@ -381,7 +380,6 @@ class Machine:
         return lambda dictionary: self.devices.build_config(node.name, dictionary)
 
     async def _bring_back(self, node: Node) -> None:
-        self._bus_of[node].ensure_open()
         await node.restart()
 
     def _node_changed(self, node: Node) -> None:

@@ -57,7 +57,7 @@ class Board:
         def draw(option: str) -> float:
             return dice.draw(getattr(setting, option), f"nodes.{name}.{option}")
 
-        blob = dictionary_blob(setting.clock_hz, setting.legacy)
+        blob = dictionary_blob(setting.clock_hz, setting.legacy, setting.config_reset)
         self.dictionary = _parsed(blob)
         self.clock_hz = round(self.dictionary.clock_freq_hz)
         self._ppm = draw("ppm")
@@ -65,11 +65,11 @@ class Board:
         self.node: WorldNode = world.add_node(
             wire,
             uuid,
-            settings=NodeSettings(ppm=self._ppm, task=self._task(0.0)),
+            settings=NodeSettings(ppm=self._ppm, task=self._task(0.0), boot_s=draw("boot_s")),
             start_clock=2**32 - round(draw("rollover_after_s") * self.clock_hz) % 2**32,
             clock_freq=self.clock_hz if setting.clock_hz else 0,
             move_count=setting.move_slots,
-            dictionary=blob if setting.clock_hz or setting.legacy else None,
+            dictionary=None if blob == dictionary_blob(0) else blob,
             legacy=setting.legacy,
         )
         self._begin(draw("power_on_s"), draw("ramp_ppm_per_s"), draw("ramp_s"))
@@ -113,18 +113,22 @@ class Board:
 
 
 @lru_cache
-def dictionary_blob(clock_hz: int, legacy: bool) -> bytes:
+def dictionary_blob(clock_hz: int, legacy: bool = False, config_reset: str = "clears") -> bytes:
     """Return the compressed dictionary of the simulated board, for a clock of CLOCK_HZ (0: as built).
 
-    LEGACY: as of firmware that does not have this project's extensions.
+    LEGACY: as of firmware that does not have this project's extensions. CONFIG_RESET: as in NodeSetting.
     """
-    if not clock_hz and not legacy:
+    if not clock_hz and not legacy and config_reset == "clears":
         size = ffi.new("uint32_t *")
         found = lib.sim_dictionary(size)
         return bytes(ffi.buffer(found, size[0]))
-    words = json.loads(zlib.decompress(dictionary_blob(0, legacy=False)))
+    words = json.loads(zlib.decompress(dictionary_blob(0)))
     if clock_hz:
         words["config"]["CLOCK_FREQ"] = clock_hz
+    if config_reset != "clears":
+        del words["commands"]["config_reset"]
+    if config_reset == "restarts":
+        words["commands"]["config_reset"] = words["commands"].pop("reset")
     if legacy:
         for table in ("config", "commands", "responses"):
             words[table] = {k: v for k, v in words[table].items() if k.split()[0] not in EXTENSIONS}

@@ -52,6 +52,10 @@ class NodeSetting:
     """A board of the older kind: without group triggers and sync pulse."""
     power_on_s: Range = option(span(0, 60, "s"), Range(0, 0))
     """When it gets power."""
+    boot_s: Range = option(span(0.001, 60, "s"), Range(0.002, 0.002))
+    """From power or reset to its firmware's start: the time of a boot loader, which is deaf."""
+    config_reset: str = option(choice("clears", "restarts", "unknown"), "clears")
+    """What this command does; ``reset`` is known to all and restarts the board."""
     same_uuid_as: str = option(text, "")
     """A double of that node: made by mistake with the same uuid."""
     uuid: str = option(text, "")
@@ -80,6 +84,12 @@ class BusSetting:
     """How late the host reads what arrived, at most."""
     noise_bytes: Range = option(span(0, 500), Range(0, 0))
     """UART: garbage that stands on the line when it is opened."""
+    usb_of: str = option(text, "")
+    """The node that the device is on, by USB: it disappears when the node is reset or loses its power."""
+    usb_gone_s: Range = option(span(0, 60, "s"), Range(0.8, 0.8))
+    """How long after the reset or the power it comes back."""
+    dtr: bool = option(flag, default=False)
+    """UART: its node is reset when DTR rises, as when the device is opened."""
     load: Range = option(span(0, 1.5), Range(0, 0))
     """Other traffic, as a share of the bus."""
     load_id: int = option(whole(0, 0x7FC), 0x7E0)

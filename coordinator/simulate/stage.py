@@ -23,6 +23,7 @@ from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from nodes.clock.clock import HostTime
 from nodes.link import LinkIO
 from nodes.link.interfaces import LinkIoInterface, OnFrame, OnLost
+from nodes.node.board_reset import SetLines, SetPower
 from nodes.virtual._sim import lib
 from nodes.virtual.plant import NodePlant
 from nodes.virtual.sim_plant import SimPlant, connect_plants
@@ -72,6 +73,8 @@ class Stage:
             if name not in self._boards:
                 self._add_stranger(name, setting)
         self.host = SimHost(self._world, self._ports)
+        for name, bus in scenario.buses.items():
+            self._plug(name, bus)
         bus_of = {name: board.wire.name for name, board in self._boards.items()}
         self._plants: dict[str, SimPlant] = {}
         actor = SimActor(
@@ -84,6 +87,17 @@ class Stage:
             self.start_plants(machine_plants(self.description, PlantSettings(seed=seed)).values())
 
     # ------------------------------------------------------------------------------------------ assembly
+
+    def _plug(self, name: str, setting: BusSetting) -> None:
+        """Make a device one that disappears at resets of its node, or that resets its node."""
+        port = self._ports.get(name)
+        if setting.usb_of and port is not None:
+            self._named(setting.usb_of, f"{self.scenario.name}: [buses.{name}]")
+            gone_s = self._draw(setting, name, "usb_gone_s")
+            self._boards[setting.usb_of].node.carries(port, gone_s)
+        if setting.dtr:
+            board = next(board for board in self._boards.values() if board.wire.name == name)
+            self.host.reset_by_dtr[name] = board.node.reset
 
     def _draw(self, setting: BusSetting, wire: str, option: str) -> float:
         return self.dice.draw(getattr(setting, option), f"buses.{wire}.{option}")
@@ -325,6 +339,10 @@ class SimHost:
     def __init__(self, world: ScriptedWorld, ports: dict[str, CanPort | UartPort]) -> None:
         self._world = world
         self._ports = ports
+        self.reset_by_dtr: dict[str, Callable[[], None]] = {}
+        """By serial device that has DTR: what happens when it rises."""
+        self.usb_switch: SetPower | None = None
+        """What switches the power of the USB ports."""
 
     def make_loop(self) -> VirtualLoop:
         """Return a loop in the world's time; ``signal`` goes to the last one made."""
@@ -352,13 +370,31 @@ class SimHost:
 
     def open_uart(self, connection: UartConnection) -> HostPort:
         """Open the port of a simulated line."""
-        return self._open(self._ports[connection.path])
+        port = self._ports[connection.path]
+        reset = self.reset_by_dtr.get(connection.path)
+        if reset is None:
+            return self._open(port)
+        level = False
 
-    def _open(self, port: CanPort | UartPort) -> HostPort:
+        def set_lines(dtr: bool, rts: bool) -> None:  # noqa: ARG001
+            nonlocal level
+            if dtr and not level:
+                reset()
+            level = dtr
+
+        if port.there:
+            set_lines(True, True)
+        return self._open(port, set_lines)
+
+    def usb_power(self) -> SetPower | None:
+        """Return what switches the power of the USB ports."""
+        return self.usb_switch
+
+    def _open(self, port: CanPort | UartPort, set_lines: SetLines | None = None) -> HostPort:
         def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
             return LinkIO.driven_by(port.open(), on_frame=on_frame, on_closed=on_closed)
 
-        return HostPort(port.name, start, lambda: None)
+        return HostPort(port.name, start, lambda: None, set_lines)
 
 
 def _wire_of(node: NodeDescription) -> str:

@@ -39,6 +39,11 @@ void board_can_status(struct node *node, struct board_can_status *out);
 int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t size); // 0, or -1: busy
 size_t board_uart_send(struct node *node, const uint8_t *data, size_t size);          // bytes taken
 
+// The SIZE bytes at address ADDR (a multiple of SIZE: 1, 2 or 4) for debug_read and debug_write; null where
+// the board does not allow it. Allow reading where it has no side effect (RAM, flash, registers that are not
+// FIFOs), and writing where no output, timer or flash changes: what the firmware has nothing in.
+volatile void *board_memory(struct node *node, uint32_t addr, uint32_t size, int write);
+
 // Restart the node soon, as a power cycle would. Returns.
 void board_reset(struct node *node);
 

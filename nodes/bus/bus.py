@@ -1,14 +1,18 @@
 """One bus or UART with its nodes: node ids, links, start and close with a clean unwind on failure."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from nodes.dictionary.cache import DictionaryCache
-from nodes.link import LinkSettings
+from nodes.link import LinkError, LinkSettings
 from nodes.link.interfaces import IoFactory, LinkInterface, LinkIoInterface, OnFrame, OnLost, OnResponses
+from nodes.node.absence import BACK_WITHIN_S, DEAF_S, REQUESTED, RETRY_S, Absence
+from nodes.node.board_reset import ResetMethod, SerialPort, power_cycle, pulse, reset_methods
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeLost
 from nodes.node.node import Node, OnClock, OnState
+from nodes.node.request_reply import QueryTimeout
+from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
 
 
@@ -39,6 +43,7 @@ class BusBase:
         self._on_notice = on_notice
         self._may_be_absent: set[Node] = set()
         self._io: LinkIoInterface | None = None
+        self._outage_until_s = float("-inf")
 
     @property
     def io(self) -> LinkIoInterface:
@@ -65,7 +70,7 @@ class BusBase:
 
     async def _start(self) -> None:
         try:
-            self._open()
+            await self._open_at_start()
         except CanductorError as error:
             if len(self._may_be_absent) < len(self.nodes):
                 raise
@@ -75,23 +80,65 @@ class BusBase:
         async with asyncio.TaskGroup() as group:
             for node in self.nodes:
                 group.create_task(self._start_node(node))
+        for node in self.nodes:  # the bus may have closed when one that was ready already had no part in it
+            if node.state is NodeState.LOST and self.outage_s() > 0:
+                await self._start_node(node)
+
+    async def _open_at_start(self) -> None:
+        """Open the bus; wait for its device when nodes are restarted, which may have made it disappear."""
+        restarted = [node.name for node in self.nodes if node.reset_first]
+        limit_s = BACK_WITHIN_S if restarted else 0.0
+        why = REQUESTED if restarted else ""
+        absence = Absence(", ".join(restarted), limit_s, why, self._on_notice)
+        while True:
+            try:
+                self._open()
+            except CanductorError as error:
+                if not absence.goes_on(str(error)):
+                    raise absence.error(str(error), error) from None
+                await asyncio.sleep(RETRY_S)
+            else:
+                absence.ended()
+                return
 
     async def _start_node(self, node: Node) -> None:
         try:
-            await node.start()
+            await self._bring_up(node)
             self._node_started(node)
         except CanductorError:
             if node not in self._may_be_absent:
                 raise
 
+    async def _bring_up(self, node: Node) -> None:
+        """Start the node; again if the bus closes because another node on it is being reset."""
+        while True:
+            try:
+                await (node.restart() if node.state is NodeState.LOST else node.start())
+            except (NodeLost, QueryTimeout, LinkError):
+                if self.outage_s() <= 0:
+                    raise
+            else:
+                return
+
+    def expect_outage(self) -> None:
+        """Record that a node is being reset, which may be the host's adapter to this bus."""
+        self._outage_until_s = asyncio.get_running_loop().time() + BACK_WITHIN_S
+
+    def outage_s(self) -> float:
+        """Return how long the bus may yet be closed because a node was reset, in s."""
+        return max(0.0, self._outage_until_s - asyncio.get_running_loop().time())
+
     def ensure_open(self) -> None:
         """Reopen the bus if it closed, so that its nodes can be restarted; raises CanductorError."""
         if self.closed_because is not None:
-            io, self._io = self._io, None
-            if io is not None:
-                io.close()
+            self._close_io()
             self._open()
             self.closed_because = None
+
+    def _close_io(self) -> None:
+        io, self._io = self._io, None
+        if io is not None:
+            io.close()
 
     def _open(self) -> None:
         self._io = self._start_io(on_frame=self._frame_handler(), on_closed=self._io_closed)
@@ -100,9 +147,7 @@ class BusBase:
         """Close all nodes and the bus; nothing is left running."""
         for node in self.nodes:
             await node.close()
-        io, self._io = self._io, None
-        if io is not None:
-            io.close()
+        self._close_io()
 
     def emergency_stop(self) -> None:
         """Stop every node that can be reached."""
@@ -147,7 +192,14 @@ def _cause(error: BaseException) -> CanductorError | None:
 
 
 class UartBus(BusBase):
-    """A UART with its one node."""
+    """A UART with its one node, which is only reset by commands unless ``resets_by`` was called."""
+
+    _port: SerialPort | None = None
+    restart_method = ResetMethod.COMMAND
+
+    def resets_by(self, method: ResetMethod, port: SerialPort) -> None:
+        """Have the node be reset by METHOD; PORT: its device."""
+        self.restart_method, self._port = method, port
 
     def add_node(
         self,
@@ -161,9 +213,37 @@ class UartBus(BusBase):
         """Add the node, before ``start``."""
         assert not self.nodes
         node = Node(
-            name, _UartConnector(self), build_config, on_state=on_state, on_clock=on_clock, cache=self._cache
+            name,
+            _UartConnector(self),
+            build_config,
+            on_state=on_state,
+            on_clock=on_clock,
+            on_notice=self._on_notice,
+            cache=self._cache,
         )
         return self._add(node, may_be_absent=may_be_absent)
+
+    def close_device(self) -> None:
+        """Close the device: only then can a board on USB that is reset get its name again."""
+        self._close_io()
+        if self._port is not None:
+            self._port.close()
+        self.closed_because = "its node was reset"
+
+    async def reset(self, method: ResetMethod) -> bool:
+        """Reset the board from outside; False when the device or the computer cannot do that."""
+        port = self._port
+        try:
+            if method is ResetMethod.RPI_USB and port is not None and port.set_power is not None:
+                self.close_device()
+                await power_cycle(port.set_power)
+                return True
+            if method is not ResetMethod.RPI_USB and port is not None and port.set_lines is not None:
+                await pulse(method, port.set_lines)
+                return True
+        except CanductorError as error:
+            self._on_notice(f"restart_method {method} failed: {error}")
+        return False
 
 
 class _UartConnector:
@@ -171,6 +251,7 @@ class _UartConnector:
         self._bus = bus
 
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
+        self._bus.ensure_open()
         return self._bus.io.open_link(
             LinkSettings(None),
             on_responses=on_responses,
@@ -180,8 +261,26 @@ class _UartConnector:
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:  # noqa: ARG002
         return 0  # a device file does not show whether its baud rate is real (USB, pseudo-terminals)
 
-    def forget(self) -> None:
+    @property
+    def reset_methods(self) -> Sequence[ResetMethod]:
+        return reset_methods(self._bus.restart_method)
+
+    async def reset(self, method: ResetMethod) -> bool:
+        return await self._bus.reset(method)
+
+    def absence_s(self) -> float:
+        return DEAF_S
+
+    def missing(self, error: CanductorError) -> str:
+        # Why the device cannot be opened is known; a device that is open has a board that does not answer.
+        opened = self._bus.closed_because is None
+        return f"nothing answers on {self._bus.name}" if opened else str(error)
+
+    def expect_reset(self) -> None:
         pass
+
+    def forget(self) -> None:
+        self._bus.close_device()
 
     def why_silent(self) -> CanductorError:
         return NodeLost(

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from nodes.bus.assign import Assignment, IdAssignment, Uuid, number_nodes, waiting_uuid
@@ -14,6 +14,7 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
 from nodes.link import Frame, LinkSettings
 from nodes.link.interfaces import IoFactory, LinkInterface, OnFrame, OnLost, OnResponses
+from nodes.node.board_reset import ResetMethod
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeError, NodeLost
 from nodes.node.node import Node, OnClock, OnState
@@ -63,7 +64,15 @@ class CanBus(BusBase):
         self._nodeids = number_nodes([*self._nodeids, uuid])
         connector = _CanConnector(self, uuid)
         self._connectors.append(connector)
-        node = Node(name, connector, build_config, on_state=on_state, on_clock=on_clock, cache=self._cache)
+        node = Node(
+            name,
+            connector,
+            build_config,
+            on_state=on_state,
+            on_clock=on_clock,
+            on_notice=self._on_notice,
+            cache=self._cache,
+        )
         self._by_uuid[uuid] = node
         return self._add(node, may_be_absent=may_be_absent)
 
@@ -218,6 +227,7 @@ class _CanConnector:
         self.assignment: Assignment | None = None
 
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
+        self._bus.ensure_open()
         if self.assignment is None:
             self.assignment = await self._bus.assign([self._uuid])
         self.assignment.check_node(self._uuid, self._bus.name)
@@ -226,6 +236,27 @@ class _CanConnector:
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
         return can_wire_ns(content_bytes, bitrate, answer=answer) if bitrate > 0 else 0
+
+    @property
+    def reset_methods(self) -> Sequence[ResetMethod]:
+        return (ResetMethod.COMMAND,)
+
+    async def reset(self, method: ResetMethod) -> bool:  # noqa: ARG002
+        return False
+
+    def absence_s(self) -> float:
+        return self._bus.outage_s()
+
+    def missing(self, error: CanductorError) -> str:
+        assignment, self.assignment = self.assignment, None  # the next attempt asks for the id again
+        if assignment is not None and self._uuid in assignment.in_bootloader:
+            return f"it is in its boot loader (Katapult) on bus {self._bus.name}, its firmware not started"
+        if assignment is not None and self._uuid in assignment.unheard:
+            return f"its uuid {self._uuid} is not heard on bus {self._bus.name}"
+        return str(error)
+
+    def expect_reset(self) -> None:
+        self._bus.expect_outage()
 
     def forget(self) -> None:
         self.assignment = None

@@ -17,6 +17,8 @@ SAMPLE_S: Final = 1e-3
 REPORT_S: Final = 0.3
 SUM_LIMIT: Final = 0xFFFF
 """Sums of samples have 16 bits on the wire."""
+OUT_OF_RANGE: Final = "ADC out of range"
+"""The reason with which a node shuts down then; it does not name the sensor."""
 RANGE_CHECKS: Final = 4
 """Number of consecutive sums out of range after which the node shuts down."""
 
@@ -41,6 +43,10 @@ class AnalogIn(Device):
         super().__init__(f"the sensor of {name}")
         self.on_value: Callable[[AnalogValue], None] = ignore
         """Called on the control loop with every measurement."""
+        self.describe: Callable[[float], str] = self._percent
+        """Returns a ratio that is out of range in the user's words."""
+        self._name = name
+        self._outside: float | None = None
         self._pin = pin
         self._low, self._high = low, high
         self._full = 1
@@ -75,6 +81,8 @@ class AnalogIn(Device):
     def started(self, node: Node) -> None:
         """Begin to measure, as NODE has become ready."""
         self._on_report(node, "analog_in_state", self._received)
+        self._outside = None
+        node.explain_shutdown(self._explain)
         clock = start_clock(node) % 2**32
         node.send("query_analog_in", oid=self._oid, clock=clock, **self._times, **self._limits)
 
@@ -82,6 +90,15 @@ class AnalogIn(Device):
         """Stop measuring."""
         times = {**self._times, "sample_count": 0}
         node.send("query_analog_in", oid=self._oid, clock=0, **times, **self._limits)
+
+    def _explain(self, reason: str) -> str:
+        """Return that this is the sensor that was out of range, by its last measurement."""
+        if reason != OUT_OF_RANGE or self._outside is None:
+            return ""
+        return f"{self._name}: {self.describe(self._outside)}"
+
+    def _percent(self, ratio: float) -> str:
+        return f"{ratio:.1%} of the converter's range, allowed are {self._low:.1%} to {self._high:.1%}"
 
     def _received(self, message: Message) -> None:
         if "values" in message.params:
@@ -92,5 +109,7 @@ class AnalogIn(Device):
         next_clock = message.integer("next_clock")
         rest_ticks = self._times["rest_ticks"]
         for index, value in enumerate(sums):
+            ratio = value / self._full
+            self._outside = None if self._low <= ratio <= self._high else ratio
             began = next_clock - (len(sums) - index) * rest_ticks
             self.on_value(AnalogValue(min(value / self._full, 1.0), began % 2**32))

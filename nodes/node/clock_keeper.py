@@ -6,7 +6,7 @@ from typing import Final
 
 from nodes.clock.clock import ClockEstimate, ClockEstimator
 from nodes.clock.wire_time import narrow
-from nodes.node.connector import Connector
+from nodes.node.connector import ClockConnector
 from nodes.node.request_reply import Answer, QueryTimeout, RequestReply
 from nodes.support.errors import CanductorError
 
@@ -24,7 +24,7 @@ class ClockKeeper:
     def __init__(
         self,
         talk: RequestReply,
-        connector: Connector,
+        connector: ClockConnector,
         *,
         on_estimate: Callable[[ClockEstimate], None],
         on_sample: Callable[[], Awaitable[None]],

@@ -13,7 +13,10 @@ from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
 from nodes.dictionary.parts import DictionaryError
 from nodes.dictionary.vocabulary import carries_identity, check_vocabulary
+from nodes.link import LinkError
 from nodes.link.interfaces import LinkInterface
+from nodes.node.absence import BACK_WITHIN_S, REQUESTED, RETRY_S, Absence
+from nodes.node.board_reset import ResetMethod
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.config import NodeConfig
 from nodes.node.connector import BuildConfig, Connector
@@ -21,16 +24,14 @@ from nodes.node.errors import NodeError, NodeLost, NodeShutdown, shutdown_senten
 from nodes.node.identify import identify
 from nodes.node.load import NodeLoad, load_of
 from nodes.node.queue_slots import share_slots
-from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, RequestReply
+from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, QueryTimeout, RequestReply
 from nodes.node.states import NodeEvent, NodeState, following
 from nodes.node.watchdog import NodeWatchdog, get_config, restarted
 from nodes.support.errors import CanductorError
 
-MAX_STARTS: Final = 3
-"""Most connections in one start: only a reset makes some nodes drop an old configuration."""
 CONFIG_RESET_TRIES: Final = 4
 RESET_SETTLE_S: Final = 0.3
-"""Time for the reset command to arrive, repeated if necessary, and for the node to boot again."""
+"""Time for the reset command to arrive, repeated if necessary, and for the node to begin to boot."""
 ALIVE_TIMEOUT_S: Final = 0.1
 """Time for a node to prove that it is alive when another board claims its identity."""
 CLOCK_TIMEOUT_S: Final = 15.0
@@ -39,6 +40,8 @@ CLOCK_TIMEOUT_S: Final = 15.0
 
 ClockSource = Literal["pulse", "exchange"]
 OnState = Callable[["Node"], None]
+ExplainShutdown = Callable[[str], str]
+"""Returns what is known of a shutdown for the given reason, in a few words; "": nothing."""
 OnClock = Callable[["Node", ClockEstimate], None]
 
 
@@ -50,8 +53,8 @@ class Node:
     """Node NAME, reached through CONNECTOR and configured as BUILD_CONFIG says.
 
     ON_STATE is called after every change of ``state``, ON_CLOCK with every new estimate of its clock, both on
-    the control loop. ``failure`` states why it is lost or shut down. Without a CACHE every start downloads
-    the dictionary.
+    the control loop; ON_NOTICE with a sentence for the user. ``failure`` states why it is lost or shut down.
+    Without a CACHE every start downloads the dictionary.
     """
 
     def __init__(
@@ -62,6 +65,7 @@ class Node:
         *,
         on_state: OnState = _ignore,
         on_clock: OnClock = _ignore,
+        on_notice: Callable[[str], None] = _ignore,
         cache: DictionaryCache | None = None,
     ) -> None:
         self.name = name
@@ -82,11 +86,14 @@ class Node:
         self._build_config = build_config
         self._on_state = on_state
         self._on_clock = on_clock
+        self._on_notice = on_notice
         self._cache = cache
         self._talk = RequestReply(name)
         self._keeper: ClockKeeper | None = None
         self._watchdog = NodeWatchdog(self._talk, 0)
+        self._explain: list[ExplainShutdown] = []
         self._starting_over = True  # messages count only once an old configuration was checked
+        self._reaching = False  # a link that is lost now is one attempt that failed
         self._generation = 0
         for response, handler in (
             ("stats", self._handle_stats),
@@ -185,6 +192,10 @@ class Node:
         """Call CALLBACK for every RESPONSE (of OID, unless None); return a function that ends it."""
         return self._talk.on(response, oid, callback)
 
+    def explain_shutdown(self, explain: ExplainShutdown) -> None:
+        """Have EXPLAIN add to the sentence of a shutdown, until the node is started again."""
+        self._explain.append(explain)
+
     def emergency_stop(self) -> None:
         """Stop the node ahead of everything queued for it; no effect on a node that cannot be reached."""
         if self._talk.connected and "emergency_stop" in self.dictionary.commands:
@@ -231,22 +242,73 @@ class Node:
             raise
 
     async def _start(self) -> None:
-        for _ in range(MAX_STARTS):
-            self._starting_over = True
-            link = await self._connector.connect(self._talk.receive, self._link_lost(self._generation))
-            self._talk.attach(link)
-            self._enter(NodeEvent.CONNECTED)
-            await self._identify()
-            self._enter(NodeEvent.IDENTIFIED)
+        """Reach the node, reset it where that is needed, configure it: every start and restart is this."""
+        self._reaching = True
+        try:
+            keeper, wanted, found = await self._prepare()
+        finally:
+            self._reaching = False
+        self.reset_first = False
+        await self._configure(found, wanted)
+        await self._wait_for_clock(keeper)
+        self._enter(NodeEvent.CONFIGURED)
+
+    async def _prepare(self) -> tuple[ClockKeeper, NodeConfig, Message]:
+        """Return when the node is neither shut down nor differently configured, after resets if necessary.
+
+        Returns what keeps its clock, its configuration as it has to be, and its configuration state.
+        """
+        methods = list(self._connector.reset_methods)
+        used: list[ResetMethod] = []
+        absence = self._absence(self._connector.absence_s(), "")
+        if self.reset_first:
+            from_outside = [method for method in methods if method is not ResetMethod.COMMAND]
+            for method in from_outside:  # reaches firmware that hangs, too
+                methods.remove(method)
+                if await self._connector.reset(method):
+                    used.append(method)
+            after = f"it was reset because {REQUESTED}" if used else REQUESTED
+            absence = self._absence(BACK_WITHIN_S, after)
+        while True:
+            found = await self._reach(absence)
             keeper = self._start_clock()
-            if await self._configure(self._build_config(self.dictionary)):
-                await self._wait_for_clock(keeper)
-                self._enter(NodeEvent.CONFIGURED)
-                return
+            wanted = self._build_config(self.dictionary)
+            why = self._why_reset(found, wanted)
+            cleared = await self._clear(methods, used, why) if why else found
+            if cleared is not None:
+                return keeper, wanted, cleared
+            absence = self._absence(BACK_WITHIN_S, f"it was reset because {why}")
+
+    def _absence(self, limit_s: float, after: str) -> Absence:
+        return Absence(self.name, limit_s, after, self._on_notice)
+
+    async def _reach(self, absence: Absence) -> Message:
+        """Connect until the node has sent its dictionary, within ABSENCE; return its configuration state."""
+        while True:
+            try:
+                found = await self._reach_once()
+            except DictionaryError:
+                raise
+            except CanductorError as error:
+                missing = self._connector.missing(error)
+                if not absence.goes_on(missing):
+                    raise absence.error(missing, error) from None
+            else:
+                absence.ended()
+                return found
             await self._disconnect()
-            self._connector.forget()
-            self._enter(NodeEvent.RESET)
-        raise NodeError(f"node {self.name} keeps its configuration after {MAX_STARTS} resets; power-cycle it")
+            self._enter(NodeEvent.SILENT)
+            await asyncio.sleep(RETRY_S)
+
+    async def _reach_once(self) -> Message:
+        self._starting_over = True
+        self._explain.clear()
+        link = await self._connector.connect(self._talk.receive, self._link_lost(self._generation))
+        self._talk.attach(link)
+        self._enter(NodeEvent.CONNECTED)
+        await self._identify()
+        self._enter(NodeEvent.IDENTIFIED)
+        return await get_config(self._talk)
 
     async def restart(self) -> None:
         """Start again, from READY, SHUTDOWN or LOST; raises like ``start``."""
@@ -311,17 +373,18 @@ class Node:
 
     # ------------------------------------------------------------------------------------------ configuring
 
-    async def _configure(self, wanted: NodeConfig) -> bool:
-        """Configure the node as WANTED; return False when it had to be reset and must be connected again."""
-        found = await get_config(self._talk)
-        other = bool(found.integer("is_config")) and found.integer("crc") != wanted.crc
-        reset_first, self.reset_first = self.reset_first, False
-        if other or reset_first or found.integer("is_shutdown"):
-            # Preferred to a reset of the whole board, which makes a USB device or CAN bridge disappear.
-            if "config_reset" not in self.dictionary.commands:
-                await self._reset()
-                return False
-            found = await self._config_reset()
+    def _why_reset(self, found: Message, wanted: NodeConfig) -> str:
+        """Return why the node cannot be configured as it is, as a clause; "": it can, or is already."""
+        if found.integer("is_shutdown"):
+            return "it was shut down"
+        if not found.integer("is_config"):
+            return ""
+        if found.integer("crc") != wanted.crc:
+            return "it had another configuration"
+        return REQUESTED if self.reset_first else ""
+
+    async def _configure(self, found: Message, wanted: NodeConfig) -> None:
+        """Configure the node, whose state is FOUND, as WANTED."""
         self._starting_over = False
         if not found.integer("is_config"):
             for command in wanted.config_commands:
@@ -334,7 +397,6 @@ class Node:
         self._watchdog = NodeWatchdog(self._talk, wanted.crc)
         for command in wanted.init_commands:
             self._talk.send_text(command)
-        return True
 
     async def _finalized(self) -> Message:
         """Query the configuration state after its last command.
@@ -355,12 +417,40 @@ class Node:
         if not found.integer("is_config") or found.integer("crc") != wanted.crc:
             raise NodeError(f"node {self.name} did not accept its configuration; restart it and try again")
 
-    async def _reset(self) -> None:
+    async def _clear(self, methods: list[ResetMethod], used: list[ResetMethod], why: str) -> Message | None:
+        """Clear the node's configuration by the first of METHODS that is possible; move it to USED.
+
+        Returns its configuration state; None: the board was reset and has to be connected again.
+        """
+        while methods:
+            method = methods.pop(0)
+            if method is ResetMethod.COMMAND and "config_reset" in self.dictionary.commands:
+                # Preferred to a reset of the whole board, which makes a USB device or CAN bridge disappear.
+                with contextlib.suppress(NodeLost, QueryTimeout, LinkError):
+                    return await self._config_reset()
+                self._connector.forget()  # a Linux process starts again, and has another pseudo-terminal then
+                done = True
+            elif method is ResetMethod.COMMAND:
+                done = await self._reset_by_command()
+            else:
+                done = await self._connector.reset(method)
+            if done:
+                used.append(method)
+                await self._disconnect()
+                self._enter(NodeEvent.RESET)
+                return None
+        found = f"resets had no effect (by {', '.join(used)})" if used else "it has no way to reset"
+        raise NodeError(f"node {self.name} has to be reset because {why}, but {found}; power-cycle it")
+
+    async def _reset_by_command(self) -> bool:
         if "reset" not in self.dictionary.commands:
-            raise NodeError(f"node {self.name} has another configuration and no way to reset; power-cycle it")
+            return False
+        self._connector.expect_reset()
         self._generation += 1  # the link is expected to break
         self._talk.send("reset")
         await asyncio.sleep(RESET_SETTLE_S)
+        self._connector.forget()
+        return True
 
     async def _config_reset(self) -> Message:
         """Clear the node's configuration. Firmware accepts config_reset only when shut down."""
@@ -414,6 +504,9 @@ class Node:
             self._on_state(self)
 
     def _fail(self, event: NodeEvent, failure: NodeError) -> None:
+        if self._reaching and event in (NodeEvent.LOST, NodeEvent.RESTARTED):
+            self._talk.fail(failure)  # the start knows whether it may be away
+            return
         if following(self.state, event) is None:
             return
         self.failure = failure
@@ -441,7 +534,9 @@ class Node:
         if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:
             return
         text = self.dictionary.enum_name("static_string_id", static_string_id)
-        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(shutdown_sentence(self.name, text)))
+        known = [words for explain in self._explain if (words := explain(text))]
+        sentence = shutdown_sentence(self.name, text) + (f" ({'; '.join(known)})" if known else "")
+        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(sentence))
 
     def _handle_starting(self, _: Message) -> None:
         if not self._starting_over:

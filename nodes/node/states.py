@@ -29,6 +29,7 @@ class NodeEvent(Enum):
     RESET = "reset, to be started again"
     SHUTDOWN = "shutdown reported"
     LOST = "no answer"
+    SILENT = "no answer yet, to be tried again"
     RESTARTED = "it restarted by itself"
     SLEEP = "put to sleep by the host"
     WAKE = "woken by the host"
@@ -38,15 +39,18 @@ class NodeEvent(Enum):
 _S, _E = NodeState, NodeEvent
 TRANSITIONS: Final = {
     (_S.CONNECTING, _E.CONNECTED): _S.IDENTIFYING,
+    (_S.CONNECTING, _E.SILENT): _S.CONNECTING,
     (_S.CONNECTING, _E.LOST): _S.LOST,
     (_S.CONNECTING, _E.SLEEP): _S.SLEEPING,
     (_S.CONNECTING, _E.CLOSE): _S.CLOSED,
     (_S.IDENTIFYING, _E.IDENTIFIED): _S.CONFIGURING,
+    (_S.IDENTIFYING, _E.SILENT): _S.CONNECTING,
     (_S.IDENTIFYING, _E.LOST): _S.LOST,
     (_S.IDENTIFYING, _E.RESTARTED): _S.LOST,
     (_S.IDENTIFYING, _E.SLEEP): _S.SLEEPING,
     (_S.IDENTIFYING, _E.CLOSE): _S.CLOSED,
     (_S.CONFIGURING, _E.CONFIGURED): _S.READY,
+    (_S.CONFIGURING, _E.SILENT): _S.CONNECTING,
     (_S.CONFIGURING, _E.RESET): _S.CONNECTING,
     (_S.CONFIGURING, _E.SHUTDOWN): _S.SHUTDOWN,
     (_S.CONFIGURING, _E.LOST): _S.LOST,

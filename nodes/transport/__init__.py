@@ -51,6 +51,6 @@ def open_can(spec: str, *, bitrate: int | None = None) -> CanTransport:
     return PythonCanBridge.open(interface, channel, bitrate=bitrate)
 
 
-def open_uart(path: str | Path, baud: int = BAUD_DEFAULT) -> ByteTransport:
+def open_uart(path: str | Path, baud: int = BAUD_DEFAULT) -> UartTransport:
     """Open the serial device at PATH at BAUD bit/s; raises CanductorError."""
     return UartTransport(path, baud)

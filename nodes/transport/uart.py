@@ -1,8 +1,10 @@
 """Transport over a UART (or a USB device or pseudo-terminal that acts like one)."""
 
 import contextlib
+import fcntl
 import os
 import select
+import struct
 import termios
 import time
 from pathlib import Path
@@ -56,6 +58,24 @@ class UartTransport:
         if not self._port.is_open:
             raise TransportClosedError(f"UART {self.name}: already closed by this program")
         return int(self._port.fd)
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether the device has DTR and RTS; a pseudo-terminal has not."""
+        try:
+            fcntl.ioctl(self.fileno(), termios.TIOCMGET, bytes(4))
+        except OSError:
+            return False
+        return True
+
+    def set_lines(self, dtr: bool, rts: bool) -> None:
+        """Set DTR and RTS; raises CanductorError. The link's thread may use the device meanwhile."""
+        try:
+            for level, line in ((dtr, termios.TIOCM_DTR), (rts, termios.TIOCM_RTS)):
+                request = termios.TIOCMBIS if level else termios.TIOCMBIC
+                fcntl.ioctl(self.fileno(), request, struct.pack("I", line))
+        except OSError as error:
+            raise CanductorError(f"UART {self.name}: cannot set DTR and RTS: {error.strerror}") from error
 
     def close(self) -> None:
         """Close the device."""

@@ -10,7 +10,8 @@ from coordinator.ipc.protocol.methods import ApiError
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from tests.profiles import examples
-from tests.stages.served import Served, running, zigzag
+from tests.stages.demo_machine import DemoMachine
+from tests.stages.served import LOOK_S, Served, running, zigzag
 
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
 MOVES = 150
@@ -158,3 +159,28 @@ def test_a_stop_in_the_middle_of_a_job_shows_no_more_motion(tmp_path: Path) -> N
 
     with asyncio.Runner(loop_factory=world.make_loop) as runner:
         runner.run(go())
+
+
+def test_progress_is_at_the_line_that_waits(tmp_path: Path) -> None:
+    """While a heater is waited for, or a macro pauses, the place in the file is that of the very line."""
+    world = DemoMachine(tmp_path, sections="[gcode_macro REST]\ngcode:\n  G4 P1000\n  G4 P3000\n")
+    lines = ["; a print", "G28", "G4 P4000", "G1 X20 F1200", "G1 X25", "REST", "G1 X30", "G4 P4000"]
+    text = "".join(f"{line}\n" for line in lines)
+
+    async def go(stage: Served) -> None:
+        stage.write_job(text)
+        await stage.call("job.start", file="job.gcode")
+        seen: dict[int, float] = {}
+        while stage.job_state != "done":
+            done = stage.tree.get("job.done_bytes")
+            assert isinstance(done, int)
+            seen[done] = seen.get(done, 0) + LOOK_S
+            await asyncio.sleep(LOOK_S)
+        begins = {line: text.index(f"{line}\n") for line in lines}
+        last = text.rindex("G4 P4000")
+        assert set(seen) <= {*begins.values(), last, len(text)}
+        for waiting in ("G4 P4000", "REST"):
+            assert seen[begins[waiting]] > 3.5, seen
+        assert seen[last] > 3.5
+
+    world.serve(go)

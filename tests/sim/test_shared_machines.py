@@ -34,8 +34,11 @@ def test_a_machine_runs_unchanged(tmp_path: Path, name: str) -> None:
                 await stage.served.call("gcode.run", script=f"M190 S{BED_C}\nM109 S{HOTEND_C}\nG4 P5000")
             assert true_c("extruder") == pytest.approx(HOTEND_C, abs=5)
             assert true_c("heater_bed") == pytest.approx(BED_C, abs=5)
-            stage.served.write_job("G1 Z5 F600\n" + "G1 X90 Y90 E4 F6000\nG1 X60 E8\nG1 Y60 E12\n")
+            text = f"G1 Z5 F600\nM109 S{HOTEND_C + 5}\nG1 X90 Y90 E4 F6000\nG1 X60 E8\nG1 Y60 E12\n"
+            stage.served.write_job(text)
             await stage.served.call("job.start", file="job.gcode")
+            heats = text.index("M109")
+            await stage.served.until(lambda: stage.served.tree.get("job.done_bytes") == heats, "M109 waits")
             await stage.served.until_job("done")
             await stage.check_all()
             told = await stage.served.call("position.get", ask_nodes=True)

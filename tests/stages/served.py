@@ -136,7 +136,7 @@ class Served:
         counted = told["nodes_steps"]
         assert isinstance(counted, dict)
         sent = {name: stepper["steps_sent"] for name, stepper in told["steppers"].items()}
-        assert counted == sent == expected
+        assert counted == sent == expected, (counted, sent, expected)
         return dict(counted)
 
 

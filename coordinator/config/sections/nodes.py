@@ -27,6 +27,7 @@ from coordinator.config.sections.probe import note_probe
 from coordinator.config.sections.virtual_endstops import note_diag_pins
 from coordinator.config.unsupported import UNSUPPORTED_MCU_OPTIONS
 from coordinator.support.quoting import nearest, shown
+from nodes.node.board_reset import ResetMethod
 
 SERIAL = TextOption(
     name="serial",
@@ -56,7 +57,9 @@ CANBUS_INTERFACE = TextOption(
 )
 RESTART_METHOD = ChoiceOption(
     name="restart_method",
-    help="how the host resets the node; by default arduino on a serial line, command on CAN",
+    help="how the host resets the node: by the pulse of DTR that Arduinos need or Cheetah boards need, by the"
+    " power of the USB ports, or by a command of the firmware, which is also tried where the others have no"
+    " effect; by default arduino on a serial line, command on CAN",
     choices=("arduino", "cheetah", "rpi_usb", "command"),
 )
 POLICY = ChoiceOption(
@@ -117,8 +120,6 @@ def _read_node(section: RawSection, unsupported: list[Unsupported]) -> NodeDescr
         )
     policy = _read_policy(reader)
     waiting = [option.name for option in reader.finish()]
-    if isinstance(connection, UartConnection) and reader.find(RESTART_METHOD) not in (None, "command"):
-        waiting.append(RESTART_METHOD.name)  # so far a node is only reset by its own commands
     if waiting:
         unsupported.append(Unsupported(section.name, section.place, tuple(waiting)))
     return NodeDescription(name, connection, section.place, policy, reader.place_of(POLICY))
@@ -144,7 +145,7 @@ def check_policies(nodes: Iterable[NodeDescription], steppers: Iterable[StepperD
 
 
 def _read_uart(reader: SectionReader) -> CanConnection | UartConnection:
-    restart = reader.find(RESTART_METHOD) or "arduino"
+    restart = ResetMethod(reader.find(RESTART_METHOD) or "arduino")
     return UartConnection(reader.get(SERIAL), reader.get(BAUD), restart, reader.place_of(SERIAL))
 
 

@@ -37,6 +37,9 @@ from nodes.node.states import NodeState
 PT100_BOARD: Final = "PT100 INA826"
 KNOWN_SENSORS: Final = (*THERMISTORS, "PT1000", PT100_BOARD, *AMPLIFIERS)
 
+WIRE_BREAK: Final = 0.01
+"""A converter this near (as a ratio) to an end of its range has no sensor, or a shorted one."""
+
 
 class TemperatureInput(TemperatureSource):
     """The sensor of section BUILD; ``on_measured`` is called with every measurement once it is connected."""
@@ -64,6 +67,7 @@ class TemperatureInput(TemperatureSource):
         self._sensor: Sensor | None = None
         self._analog = AnalogIn(build.name, pin=self._pin.name)
         self._analog.on_value = self._came
+        self._analog.describe = self._out_of_range
         build.add_device(self._pin.node, self._analog, self._pin)
 
     def link(self, modules: Modules) -> None:
@@ -117,6 +121,12 @@ class TemperatureInput(TemperatureSource):
     def node(self) -> str:
         """The node it is on."""
         return self._pin.node
+
+    def _out_of_range(self, ratio: float) -> str:
+        assert self._sensor is not None
+        found = f"{self._sensor.celsius(ratio):.0f} °C, allowed are {self.min_c:g} to {self.max_c:g} °C"
+        at_the_end = not WIRE_BREAK < ratio < 1 - WIRE_BREAK
+        return f"{found}; is a wire broken or shorted?" if at_the_end else found
 
     def _came(self, value: AnalogValue) -> None:
         assert self._sensor is not None

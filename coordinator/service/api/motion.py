@@ -132,6 +132,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
 
     async def position(_caller: Caller, params: dict[str, Any]) -> Value:
         motion = service.ready_motion()
+        await motion.begun.wait()
         output = position_figures(motion)
         output["offset"] = axes(motion.planned.offset)
         output["steppers"] = _stepper_figures(service.up_machine(), motion)

@@ -61,6 +61,8 @@ class Motion:
             on_state=self._cycle_ended,
             on_cycle=on_cycle,
         )
+        self.begun = asyncio.Event()
+        """Set once ``planned`` is known, or never will be: a moment after the machine is ready."""
         self.works = 0
         """Done so far."""
         self._ending: list[QueuedWork] = []
@@ -71,6 +73,7 @@ class Motion:
         try:
             await self.streamer.run()
         finally:
+            self.begun.set()
             self.feeder.abandon()
             for done in self._waited_for.values():
                 done.cancel()
@@ -137,6 +140,7 @@ class Motion:
 
     def _cycle_ended(self, planned: Planned) -> None:
         self.planned = planned
+        self.begun.set()
         now_s = self.now_s
         comes_to_rest = planned.stands_from_s is not None
         self.lead.look(now_s, self.streamer.worker.steps.generated_until, comes_to_rest=comes_to_rest)

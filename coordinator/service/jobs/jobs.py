@@ -1,12 +1,12 @@
 """The job of a machine: one file at a time, from its start to its end."""
 
-from collections import deque
 from enum import StrEnum
-from typing import Final
 
+from coordinator.gcode.events import Progress
 from coordinator.service.core.feeder import Feeder, QueuedWork
 from coordinator.service.core.motion import Motion
 from coordinator.service.core.work import FileWork
+from coordinator.service.jobs.file_places import FilePlaces
 from nodes.support.errors import CanductorError
 
 
@@ -27,8 +27,6 @@ class JobPhase(StrEnum):
     """The machine stopped."""
 
 
-TRAIL_MAX: Final = 512
-"""Places of the file between what is carried out and what is read; there are some 20 a second."""
 ACTIVE = frozenset((JobPhase.PRINTING, JobPhase.PAUSING, JobPhase.PAUSED, JobPhase.CANCELLING))
 
 
@@ -55,7 +53,11 @@ class JobRun:
         self.filament_mm = 0.0
         """Of the extruder, drawn in since the begin."""
         self._extruded = False
-        self._trail = Trail()
+        self._done_bytes = 0
+        self._places = FilePlaces()
+        program = work.program
+        self._places.add(program.data[program.start :], program.done_bytes)
+        program.on_piece = self._places.add
         self._looked_s = now_s
         self._began_e = motion.moment().position[3]
         self._motion = motion
@@ -89,7 +91,7 @@ class JobRun:
     @property
     def done_bytes(self) -> int:
         """Bytes carried out."""
-        return self.size_bytes if self.phase is JobPhase.DONE else self._trail.done_bytes
+        return self.size_bytes if self.phase is JobPhase.DONE else self._done_bytes
 
     @property
     def progress(self) -> float:
@@ -138,11 +140,20 @@ class JobRun:
         if moment.moving and moment.line and began_s is not None and self._motion.now_s >= began_s:
             self.line = max(self.line, moment.line)  # others that come between count from 1
         queued = self._queued
-        self._trail.look(queued.progress.line, queued.progress.done_bytes, self.line)
+        self._find_place(queued.progress, began_s is not None and self._motion.now_s >= began_s)
         if queued.done:
             self._ended(queued, now_s)
         elif self.phase is JobPhase.PAUSING and self._motion.paused:
             self.phase = JobPhase.PAUSED
+
+    def _find_place(self, read: Progress, begun: bool) -> None:
+        """Find where the line begins that is carried out."""
+        self._places.read(read.line, read.done_bytes)
+        # At standstill the reader itself waits, behind the line that it waits for.
+        waits = begun and self._motion.standing
+        place = self._places.begin_before(read.done_bytes) if waits else self._places.begin_of(self.line)
+        self._done_bytes = max(self._done_bytes, place or 0)
+        self._places.forget_before(self._done_bytes)
 
     def _follow_programs(self) -> None:
         """Follow what a program requested: pause, resume, cancel."""
@@ -170,26 +181,3 @@ class JobRun:
     @property
     def _feeder(self) -> Feeder:
         return self._motion.feeder
-
-
-class Trail:
-    """Where in the file the line is that is carried out, from where each look found the reader."""
-
-    def __init__(self) -> None:
-        self.done_bytes = 0
-        """Where the line carried out begins, as near as the looks were; never goes back."""
-        self._places: deque[tuple[int, int]] = deque([(0, 0)])  # lines and bytes read, oldest first
-
-    def look(self, lines_read: int, read_bytes: int, line: int) -> None:
-        """Record that so much is read while LINE is executed."""
-        places = self._places
-        if lines_read > places[-1][0]:
-            if len(places) == TRAIL_MAX:
-                places.pop()  # coarser, never wrong
-            places.append((lines_read, read_bytes))
-        before = max(0, line - 1)
-        while len(places) > 1 and places[1][0] <= before:
-            places.popleft()
-        (lines, begin), (more, end) = places[0], places[min(1, len(places) - 1)]
-        part = (before - lines) / (more - lines) if more > lines else 0.0
-        self.done_bytes = max(self.done_bytes, begin + int(max(0.0, part) * (end - begin)))

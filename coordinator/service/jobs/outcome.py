@@ -73,9 +73,9 @@ async def outcome_of(machine: Machine, streamer: Streamer) -> Outcome:
 
 
 def job_progress(machine: Machine, motion: Motion, job: JobRun, now_s: float) -> Progress:
-    """Return how far JOB is read at NOW_S of the host's time, and how the links to its nodes do."""
+    """Return how far JOB is carried out at NOW_S of the host's time, and how the links to its nodes do."""
     return Progress(
-        done=job.read_bytes,
+        done=job.done_bytes,
         total=job.size_bytes,
         print_time_s=motion.streamer.executed_s,
         wall_time_s=now_s - job.began_s,

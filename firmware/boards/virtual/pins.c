@@ -5,6 +5,7 @@
 
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 DECL_ENUMERATION_RANGE("pin", "PA0", 0, 16);
 DECL_ENUMERATION_RANGE("pin", "PB0", 16, 16);
@@ -20,8 +21,11 @@ DECL_ENUMERATION("pin", "ADC_TEMPERATURE", 254);
 // The chip's own sensor: always 35 degrees by the line of RP2040, (0.706 - 8 * 0.001721) / 3.3 of full scale.
 enum { CHIP_PIN = 254, CHIP_SAMPLE = 859 };
 
+DECL_CONSTANT("DEBUG_MEMORY", 536870912);
+DECL_CONSTANT("DEBUG_MEMORY_SIZE", 256);
 DECL_CONSTANT("ADC_MAX", 4095);
 DECL_CONSTANT("PWM_MAX", 32768);
+_Static_assert(VIRTUAL_SCRATCH_BASE == 536870912 && VIRTUAL_SCRATCH == 256, "likewise");
 _Static_assert(VIRTUAL_ADC_MAX == 4095 && VIRTUAL_PWM_MAX == 32768, "the constants above tell the host");
 
 static struct virtual_board *board_of(struct node *node) {
@@ -55,6 +59,7 @@ static void set_pwm(struct virtual_board *board, uint32_t pin, uint16_t value) {
 
 void virtual_pins_reset(struct virtual_board *board) {
     struct plant *plant = board->plant;
+    memset(board->scratch, 0, sizeof(board->scratch));
     if (plant)
         plant_reset(plant, virtual_true_ns(board));
     board->plant = NULL; // for it the pins float, whatever the log says
@@ -147,4 +152,10 @@ void board_can_status(struct node *node, struct board_can_status *out) {
     *out = (struct board_can_status){.state = BOARD_CAN_ACTIVE};
     if (board->can_status)
         board->can_status(board, out);
+}
+
+volatile void *board_memory(struct node *node, uint32_t addr, uint32_t size, int write) {
+    (void)write; // all of it may be written
+    uint32_t at = addr - VIRTUAL_SCRATCH_BASE;
+    return at <= VIRTUAL_SCRATCH - size ? (uint8_t *)board_of(node)->scratch + at : NULL;
 }

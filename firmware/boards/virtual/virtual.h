@@ -9,6 +9,10 @@
 
 // Converters idle at what a 100 kOhm thermistor at 25 °C gives below 4.7 kOhm: sensors without a plant are
 // sound.
+//
+// For debug_read and debug_write there are VIRTUAL_SCRATCH bytes from VIRTUAL_SCRATCH_BASE on, and nothing
+// else: a process's own memory is not the host's business. A reset clears them.
+enum { VIRTUAL_SCRATCH_BASE = 0x20000000, VIRTUAL_SCRATCH = 256 };
 enum { VIRTUAL_PINS = PLANT_PINS, VIRTUAL_ADC_MAX = 4095, VIRTUAL_PWM_MAX = 32768, VIRTUAL_ADC_IDLE = 3911 };
 
 // First member of a board's own struct; its first member in turn is the node.
@@ -16,6 +20,7 @@ struct virtual_board {
     struct node node;
     uint8_t level[VIRTUAL_PINS];
     uint16_t adc[VIRTUAL_PINS], pwm[VIRTUAL_PINS];
+    uint32_t scratch[VIRTUAL_SCRATCH / sizeof(uint32_t)];
     // Changes of outputs, oldest first: clock (48 bits) << 16 | pin << 1 | level.
     uint64_t *edges;
     size_t edge_count, edge_room;

@@ -193,10 +193,14 @@ struct world_port *world_noticed(struct world *world) {
 
 // ------------------------------------------------------------------------------------------- open and close
 
+int world_port_there(const struct world_port *port) {
+    return now_of(port) >= port->back_ns;
+}
+
 struct io_bus *world_port_open(struct world_port *port, const struct io_settings *settings) {
     static const struct io_driver driver = {driver_now,  driver_lock,   driver_lock,
                                             driver_kick, driver_notify, NULL};
-    if (port->bus)
+    if (port->bus || !world_port_there(port))
         return NULL;
     port->bus = io_new(port->uart ? IO_BYTES : IO_CAN_STREAM, settings, &driver, port);
     if (port->bus && port->can && !port->controller.powered)

@@ -203,6 +203,20 @@ static void stop(struct world_node *node) {
     node->life++;
 }
 
+static void device_gone(struct world_node *node, uint64_t back_ns) {
+    struct world_port *port = node->device;
+    if (!port)
+        return;
+    if (world_port_there(port))
+        world_port_fail(port, 0);
+    port->back_ns = back_ns;
+}
+
+void world_node_carries(struct world_node *node, struct world_port *port, uint64_t gone_ns) {
+    node->device = port;
+    node->device_gone_ns = gone_ns;
+}
+
 static void boot_due(void *owner) {
     struct world_node *node = owner;
     node->counters.running = 1;
@@ -220,11 +234,13 @@ void world_node_reset(struct world_node *node) {
     agenda_note(agenda, node->number);
     node->counters.resets++;
     stop(node);
+    device_gone(node, agenda->now_ns + node->device_gone_ns);
     agenda_plan(agenda, &node->boot, agenda->now_ns + node->settings.boot_ns);
 }
 
 void world_node_power_off(struct world_node *node) {
     stop(node);
+    device_gone(node, AGENDA_NEVER);
     node->counters.powered = 0;
 }
 
@@ -233,6 +249,8 @@ void world_node_power_on(struct world_node *node, uint64_t start_clock) {
     if (node->counters.powered)
         return;
     node->counters.powered = 1;
+    if (node->device)
+        node->device->back_ns = agenda->now_ns + node->device_gone_ns;
     double ppm = crystal_ppm(&node->crystal, agenda->now_ns);
     crystal_start(&node->crystal, node->crystal.nominal_hz, agenda->now_ns, start_clock, ppm);
     agenda_plan(agenda, &node->boot, agenda->now_ns + node->settings.boot_ns);

@@ -56,6 +56,8 @@ struct world_node {
     struct world_can *can;
     struct world_uart *uart;
     struct can_controller controller;
+    struct world_port *device; // of the host, on this board; or null
+    uint64_t device_gone_ns;
     struct chance chance;
     struct crystal crystal;
     uint32_t number, life;
@@ -87,6 +89,7 @@ struct world_port {
     uint8_t out[HOST_OUT]; // what the transmit queue did not accept
     size_t out_at, out_size;
     uint64_t retry_ns;
+    uint64_t back_ns; // there is no such device before
 };
 
 // A planned change of an input.

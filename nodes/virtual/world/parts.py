@@ -140,11 +140,23 @@ class Port:
 
     def open(self, settings: BusSettings | None = None) -> "SimDriver":
         """Start a bus; SETTINGS: as for a real one, by default with the wire's bit rate."""
+        if not lib.world_port_there(self._raw):
+            raise WorldError(f"{self.name}: there is no such device")
         known = settings or BusSettings(bitrate=self.bitrate)
         bus = lib.world_port_open(self._raw, ffi.new("struct io_settings *", known.as_dict()))
         if bus == ffi.NULL:
             raise WorldError(f"{self.name}: the port is in use; close the bus on it first")
         return SimDriver(self._world, self._raw, bus, self.name, serial=self.serial)
+
+    @property
+    def raw(self) -> Any:
+        """The port in C."""
+        return self._raw
+
+    @property
+    def there(self) -> bool:
+        """Whether the device is there, to be opened."""
+        return bool(lib.world_port_there(self._raw))
 
     def fail(self, cause: int = 0) -> None:
         """Remove the adapter: the bus ends with errno CAUSE (0: end of file)."""

@@ -108,6 +108,9 @@ void world_node_power_off(struct world_node *node);
 void world_node_power_on(struct world_node *node, uint64_t start_clock);
 // From now on the clock runs PPM above nominal, rising by PPM_PER_S.
 int world_node_set_rate(struct world_node *node, double ppm, double ppm_per_s);
+// The host's PORT is a USB device on this board: it disappears when the board is reset or loses its power,
+// and comes back GONE_NS after the reset or the power.
+void world_node_carries(struct world_node *node, struct world_port *port, uint64_t gone_ns);
 double world_node_ppm(const struct world_node *node);
 uint64_t world_node_clock(const struct world_node *node);
 // Computes the true times, in ps, at which the clock became CLOCKS (64 bits, since the last power on).
@@ -146,7 +149,9 @@ struct world_port *world_add_uart_port(struct world *world, struct world_uart *u
 struct world_port_settings *world_port_settings(struct world_port *port);
 struct can_controller *world_port_controller(struct world_port *port);
 const struct world_port_counters *world_port_counters(const struct world_port *port);
-// Starts and ends a bus on the port. NULL: no memory, or there is one.
+// Whether the device is there.
+int world_port_there(const struct world_port *port);
+// Starts and ends a bus on the port. NULL: no memory, there is one, or no device.
 struct io_bus *world_port_open(struct world_port *port, const struct io_settings *settings);
 void world_port_close(struct world_port *port);
 // Removes the adapter: the bus ends with CAUSE (an errno, 0: end of file).

@@ -229,6 +229,10 @@ class WorldNode:
         _check_clock(start_clock)
         lib.world_node_power_on(self.raw, start_clock)
 
+    def carries(self, port: CanPort | UartPort, gone_s: float) -> None:
+        """Have PORT be a USB device on this board, which disappears at resets and comes back after GONE_S."""
+        lib.world_node_carries(self.raw, port.raw, to_ns(gone_s, "an absence"))
+
     def set_pace(self, *, task: Latency | None = None, irq_jitter_s: float | None = None) -> None:
         """Change its latencies."""
         settings = lib.world_node_settings(self.raw)
@@ -236,6 +240,10 @@ class WorldNode:
             _assign(settings.task, task.as_dict())
         if irq_jitter_s is not None:
             settings.irq_jitter_ns = to_ns(irq_jitter_s, "a jitter")
+
+    def set_boot(self, boot_s: float) -> None:
+        """From the next reset on its firmware starts after BOOT_S."""
+        lib.world_node_settings(self.raw).boot_ns = to_ns(boot_s, "a boot time")
 
     def set_rate(self, ppm: float, ppm_per_s: float = 0.0) -> None:
         """From now on its clock runs PPM above nominal, rising by PPM_PER_S: a board that warms up."""

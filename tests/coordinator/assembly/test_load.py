@@ -217,3 +217,12 @@ def test_specifications_are_fit_for_the_reference_page(spec: SectionSpec) -> Non
 def test_acting_sections_are_not_in_the_waiting_table() -> None:
     acting = {word.strip("[] ,") for title in SECTIONS for word in title.split() if "[" in word}
     assert not acting & UNSUPPORTED_SECTIONS
+
+
+@pytest.mark.parametrize("method", ["arduino", "cheetah", "rpi_usb", "command"])
+def test_every_restart_method_acts(tmp_path: Path, method: str) -> None:
+    machine = load_machine(write(tmp_path, changed("ttyACM0", f"ttyACM0\nrestart_method: {method}")))
+    uart = machine.nodes[1].connection
+    assert isinstance(uart, UartConnection)
+    assert uart.restart_method == method
+    assert not machine.unsupported

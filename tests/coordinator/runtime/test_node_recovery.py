@@ -65,6 +65,9 @@ class TwinHost:
             raise CanductorError(f"UART {connection.path}: there is no such device")
         return self._port(connection.path, self.uart)
 
+    def usb_power(self) -> None:
+        pass
+
     def _port(self, name: str, io: TwinIO) -> Port:
         self.open_ports += 1
 

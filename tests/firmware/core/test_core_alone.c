@@ -29,6 +29,11 @@ void board_irq_restore(struct node *node, uint32_t state) {
     CHECK_EQUAL(--irq_depth, state);
 }
 
+volatile void *board_memory(struct node *node, uint32_t addr, uint32_t size, int write) {
+    (void)node, (void)addr, (void)size, (void)write;
+    return NULL;
+}
+
 void board_reset(struct node *node) {
     (void)node;
     resets++;
@@ -42,7 +47,7 @@ const uint16_t string_timer_too_close = 1, string_timer_in_past = 2, string_comm
                string_not_shutdown = 4, string_invalid_command = 5, string_parser_error = 6,
                string_encode_error = 7, string_move_overflow = 8, string_alloc_failed = 9,
                string_oids_allocated = 10, string_cannot_assign_oid = 11, string_invalid_oid_type = 12,
-               string_already_finalized = 13;
+               string_already_finalized = 13, string_debug_address = 14;
 
 static const uint8_t types_shutdown[] = {WIRE_U32, WIRE_U16};
 const struct node_response response_shutdown = {.types = types_shutdown, .id = 20, .arg_count = 2};
@@ -51,7 +56,7 @@ const struct node_response response_stats = {.types = types_stats, .id = 21, .ar
 static const uint8_t types_none[] = {0};
 const struct node_response response_starting = {.types = types_none, .id = 22};
 const struct node_response response_is_shutdown, response_config, response_identify_response, response_clock,
-    response_uptime, response_pong;
+    response_uptime, response_pong, response_debug_result;
 
 static char runs[RUNS_MAX];
 static unsigned rounds_wanted, ticks_per_task;

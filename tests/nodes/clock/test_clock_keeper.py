@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from nodes.clock.clock import SETTLE_SAMPLES, ClockEstimate
-from nodes.link.interfaces import LinkInterface, OnLost, OnResponses
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.errors import NodeLost, NodeShutdown
 from nodes.node.request_reply import RequestReply
@@ -49,21 +48,9 @@ class Bench:
 
     # What a connector does:
 
-    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
-        raise AssertionError("it is connected")
-
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
         self.blocks.append((content_bytes, bitrate, answer))
         return BACK_NS if answer else OUT_NS
-
-    def forget(self) -> None:
-        raise AssertionError("it was not reset")
-
-    def why_silent(self) -> Exception | None:
-        return None
-
-    def check_identity(self, found: bytes) -> None:
-        raise AssertionError("it was not asked")
 
     def suspect(self) -> None:
         self.suspected_s.append(asyncio.get_running_loop().time())
