@@ -1,4 +1,4 @@
-"""Latency of G-code templates: a macro of 20 lines that looks at the machine, and attacks until their sentence."""
+"""Latency of G-code templates: a macro of 20 lines that looks at the machine; attacks to their sentence."""
 
 import statistics
 import tempfile

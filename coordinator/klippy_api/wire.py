@@ -46,6 +46,12 @@ class Framer:
         self._rest = bytearray()
         self._scanned = 0
 
+    def copy(self) -> "Framer":
+        """Return one that has what this one has and goes on by itself; from any thread."""
+        twin = Framer()
+        twin._rest = self._rest[:]
+        return twin
+
     def feed(self, data: bytes | memoryview) -> list[bytes]:
         """Return the messages that DATA completes; raises TooLongError."""
         self._rest += data

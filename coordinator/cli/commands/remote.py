@@ -88,7 +88,7 @@ def _send(given: argparse.Namespace) -> Answer:
 
 
 def _estop(given: argparse.Namespace) -> Answer:
-    result = target_of(given).call("machine.emergency_stop")
+    result = target_of(given).call_first("machine.emergency_stop")
     return Answer(result, "stopped: every node was ordered to shut down")
 
 

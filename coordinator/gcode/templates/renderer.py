@@ -39,6 +39,9 @@ ASKS_MAX: Final = 10_000
 """Values that one rendering may look at."""
 TEMPLATES_MAX: Final = 1_000
 """Compiled ones that the process keeps; then it is started again."""
+LOOKS_KEPT: Final = 50
+"""Values that a template gets at once, because it has looked at them before."""
+_CHUNK_BYTES: Final = 65_536
 _ROOT: Final = Path(__file__).parents[3]
 
 
@@ -88,6 +91,9 @@ class _Process:
         self._poll.register(self._channel, select.POLLIN)
         self.numbers: dict[str, int] = {}
         """Of the templates that it has compiled."""
+        self._looks: dict[int, list[tuple[str, ...]]] = {}
+        """By template: what it has looked at so far; the next time it gets that at once."""
+        self._received = bytearray()
         self.alive = True
         self._until_cpu_s = float("inf")
         self._limit_s = 0.0
@@ -114,8 +120,9 @@ class _Process:
     def render(self, text: str, values: Mapping[str, object], printer: Mapping[str, Any]) -> Answer:
         """Render TEXT with VALUES; what it looks at of PRINTER is asked for."""
         number = self.compile(text)
+        looks = self._looks.setdefault(number, [])
         self._begin(CPU_S)
-        self._send(("render", number, dict(values)))
+        self._send(("render", number, dict(values), {path: _look(printer, path) for path in looks}))
         for _ in range(ASKS_MAX):
             answer, made, lines = self._receive()
             if "ask" not in answer:
@@ -125,7 +132,11 @@ class _Process:
                 return Answer(
                     made, lines, _actions(answer), None if end is None else str(end), emergency=emergency
                 )
-            self._send(_look(printer, answer["ask"]))
+            asked = answer["ask"]
+            path = tuple(str(name) for name in asked) if isinstance(asked, list) else ()
+            if len(looks) < LOOKS_KEPT:
+                looks.append(path)
+            self._send(_look(printer, path))
         raise self._end(f"it looks at more than {ASKS_MAX} values")
 
     def close(self) -> None:
@@ -167,17 +178,19 @@ class _Process:
             raise self._end(str(error)) from None
 
     def _read(self, size: int, until_s: float) -> bytes:
-        data = bytearray()
-        while len(data) < size:
+        received = self._received
+        while len(received) < size:
             self._wait(until_s)
             try:
-                chunk = self._channel.recv(size - len(data))
+                chunk = self._channel.recv(_CHUNK_BYTES)
             except OSError:
                 chunk = b""
             if not chunk:
                 raise self._end(self._silence())
-            data += chunk
-        return bytes(data)
+            received += chunk
+        data = bytes(received[:size])
+        del received[:size]
+        return data
 
     def _wait(self, until_s: float) -> None:
         """Wait until there is something to read, for as long as the limits allow."""
@@ -277,11 +290,11 @@ def _actions(answer: Mapping[str, Any]) -> Actions:
     )
 
 
-def _look(printer: Mapping[str, Any], path: object) -> tuple[object, ...]:
+def _look(printer: Mapping[str, Any], path: tuple[str, ...]) -> tuple[object, ...]:
     """Return what PRINTER has under PATH, as an answer to the worker."""
     found: Any = printer
     try:
-        for name in path if isinstance(path, list) else ():
+        for name in path:
             found = found[name]
         if isinstance(found, Mapping) and not isinstance(found, dict):
             return "names", [str(name) for name in found]

@@ -109,6 +109,8 @@ class Worker:
         self._channel = channel
         self._compiler = TemplateCompiler()
         self._compiled: dict[int, Template] = {}
+        self._known: dict[tuple[str, ...], tuple[Any, ...]] = {}
+        """What the program has sent with the request, by path."""
 
     def run(self) -> None:
         """Serve until the program ends."""
@@ -135,8 +137,10 @@ class Worker:
         return names
 
     def _request(self, path: tuple[str, ...]) -> tuple[Any, ...]:
-        self._answer({"ask": path})
-        answer = read_request(self._channel)
+        answer = self._known.get(path)
+        if answer is None:
+            self._answer({"ask": path})
+            answer = read_request(self._channel)
         if answer is None:
             raise SystemExit
         if answer[0] == "failed":
@@ -154,7 +158,10 @@ class Worker:
         else:
             self._answer({"compiled": True})
 
-    def _render(self, number: int, values: Mapping[str, object]) -> None:
+    def _render(
+        self, number: int, values: Mapping[str, object], known: dict[tuple[str, ...], tuple[Any, ...]]
+    ) -> None:
+        self._known = known
         meter = Meter()
         actions = Actions(meter)
         printer = RemoteMapping(self, ())

@@ -60,7 +60,11 @@ class Client:
         tls: ssl.SSLContext | None,
         encoding: Encoding,
         timeout_s: float,
+        first: str | None,
     ) -> None:
+        self.first: asyncio.Task[Any] | None = None
+        """The answer to the call that was sent right behind the hello."""
+        self._first = first
         self.address = address
         self.hello: Hello | None = None
         """Of the connection that is open; None while there is none."""
@@ -97,11 +101,14 @@ class Client:
         tls: ssl.SSLContext | None = None,
         encoding: Encoding = Encoding.MSGPACK,
         timeout_s: float = 5.0,
+        first: str | None = None,
     ) -> Self:
         """Return a client of the machine at ADDRESS (see ``read_address``) to be entered.
 
         TLS: None trusts what this computer trusts. TIMEOUT_S: for connecting, and for calls while it is not
-        connected. Raises CanductorError for what is no address; entering raises it when nobody answers there.
+        connected. FIRST: a method that is called without waiting for the answer to the hello, so that an
+        emergency stop is there even when nobody reads. Raises CanductorError for what is no address; entering
+        raises it when nobody answers there.
         """
         return cls(
             read_address(address),
@@ -111,6 +118,7 @@ class Client:
             tls=tls,
             encoding=encoding,
             timeout_s=timeout_s,
+            first=first,
         )
 
     async def __aenter__(self) -> Self:
@@ -246,6 +254,9 @@ class Client:
             raise ConnectionLost(connect_error_sentence(address, error)) from None
         self._wire = WireReader(LIMITS, checked=False)
         hello = asyncio.create_task(self._ask("api.hello", self._hello_params))
+        if self._first is not None:
+            self.first = asyncio.create_task(self._ask(self._first, {}))
+            self._first = None
         try:
             while not hello.done():
                 await self._read_some(tls_hint(address))

@@ -62,6 +62,10 @@ _TOLD: Final = (
 )
 
 
+BY_LINE: Final = f"{EMERGENCY} of a client"
+"""Who stops the machine by a line of g-code."""
+
+
 @dataclass(frozen=True, slots=True)
 class ScriptOutcome:
     """What lines of a client answered."""
@@ -79,7 +83,7 @@ async def run_script(service: MachineService, script: str, *, wait: bool) -> Scr
     lines = _lines(script)
     names = _commands(lines)
     if EMERGENCY in names:
-        service.emergency_stop(f"{EMERGENCY} of a client")
+        service.emergency_stop(BY_LINE)
         return ScriptOutcome()
     if _restarted(service, names):
         return ScriptOutcome()
@@ -149,6 +153,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         run,
         params=(Param("script", Kind.STR, "lines", high=LINES_BYTES_MAX), _WAIT),
         returns=_TOLD,
+        stops=_who_stops,
     )
     for name, call, sentence in (
         ("move.to", move_to, "Move straight to a place in the machine's frame, whatever g-code modes hold."),
@@ -234,6 +239,13 @@ def _lines(script: str) -> list[str]:
     if not any(line.strip() for line in lines):
         raise ApiError("bad_params", "gcode.run: script has no line")
     return lines
+
+
+def _who_stops(_caller: Caller, params: dict[str, Any]) -> str | None:
+    try:
+        return BY_LINE if EMERGENCY in _commands(_lines(params["script"])) else None
+    except CanductorError:
+        return None
 
 
 def _commands(lines: list[str]) -> list[str]:
