@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import signal
+from collections.abc import Callable
 from typing import Final
 
 from coordinator.ipc.server.stop_lane import StopLane
@@ -42,25 +43,27 @@ class StopPath:
 
     def stop(self, who: str) -> None:
         """Stop the nodes at once, and have the loop enter that WHO did; in any thread."""
-        if self._stop_nodes():
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                self._loop.call_soon_threadsafe(self._service.emergency_stop, who)
+        self._stop_nodes(lambda: self._service.emergency_stop(who))
 
-    def _stop_nodes(self) -> bool:
-        """Stop the nodes of the machine that runs; return False if that was done."""
+    def _stop_nodes(self, then: Callable[[], None]) -> None:
+        """Stop the nodes of the machine that runs, unless that was done; the loop calls THEN when it can."""
         machine = self._service.machine
         if machine is None or machine is self._stopped or machine.stopped is not None:
-            return False
+            return
         self._stopped = machine
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            # First: what the nodes say of their stop must not come to the loop before the cause.
+            self._loop.call_soon_threadsafe(then)
         machine.stop_nodes()
-        return True
 
     def _while_held(self) -> None:
         self.lane.look()
-        if isinstance(self._loop, WatchedLoop) and self._service.moves:
-            came = SIGNALS.intersection(self._loop.pending_signals())
-            if came and self._stop_nodes():
-                self._loop.call_soon_threadsafe(self._service.cut_off_motion)
+        if (
+            isinstance(self._loop, WatchedLoop)
+            and self._service.moves
+            and SIGNALS.intersection(self._loop.pending_signals())
+        ):
+            self._stop_nodes(self._service.cut_off_motion)
 
     def _report(self, sentence: str) -> None:
         self._service.log.add("notice", sentence)
