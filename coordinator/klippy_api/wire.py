@@ -17,8 +17,8 @@ END: Final = b"\x03"
 MESSAGE_BYTES_MAX: Final = 262_144
 """One message of a client, without its end."""
 LIMITS: Final = Limits(nesting=64, items=8_192)
-URGENT: Final = (b"emergency_stop", b"M112")
-"""A message with one of these words overtakes all others that wait."""
+URGENT: Final = (b"EMERGENCY_STOP", b"M112")
+"""A message with one of these words, in capitals or not, overtakes all others that wait."""
 
 
 class TooLongError(CanductorError):
@@ -71,7 +71,8 @@ class Framer:
 
 def is_urgent(body: bytes) -> bool:
     """Return whether BODY may be a call that stops the machine."""
-    return any(word in body for word in URGENT)
+    capitals = body.upper()
+    return any(word in capitals for word in URGENT)
 
 
 def read_request(body: bytes) -> Request:
