@@ -12,10 +12,12 @@ from typing import NoReturn
 
 import pytest
 
+from coordinator.ipc.protocol.methods import Caller, Scope
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.klippy_api.gateway import Gateway
 from coordinator.runtime.host import LinuxHost
+from coordinator.service.api.motion import motion_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.core.typed import Typed
 from tests.stages.jump_loop import run
@@ -76,6 +78,14 @@ def test_old_and_new_clients_stop_the_machine(tmp_path: Path) -> None:
         await gateway.close()
 
     run(main())
+
+
+def test_lines_of_a_client_stop_the_machine() -> None:
+    (run_lines,) = [method for method in motion_methods(_service()) if method.name == "gcode.run"]
+    caller = Caller("a test", Scope.OPERATE)
+    assert run_lines.stops(caller, {"script": "G28\nn1 m112*50"}) == "M112 of a client"
+    for script in ("", "M117 M112", "M1120", "G28 X("):
+        assert run_lines.stops(caller, {"script": script}) is None
 
 
 def test_a_line_typed_at_the_terminal_stops_the_machine(
