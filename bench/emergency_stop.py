@@ -1,4 +1,4 @@
-"""From the emergency stop's last byte to the pin of a node, on virtual nodes in real time: the loop free, and held."""
+"""From the emergency stop's last byte to the pin of a virtual node: with the loop free, and held."""
 
 import json
 import socket
