@@ -9,7 +9,7 @@ from typing import Any, Final
 from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
 from coordinator.gcode.builtins.machine import is_tool
 from coordinator.gcode.errors import GCodeError
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
 from coordinator.modules.module_set import INTERRUPTING
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.feeder import FeederFull, QueuedWork
@@ -62,6 +62,8 @@ _TOLD: Final = (
 )
 
 
+HOMED_AXES: Final = "XYZ"
+"""Letters that ``move.home`` takes."""
 BY_LINE: Final = f"{EMERGENCY} of a client"
 """Who stops the machine by a line of g-code."""
 
@@ -129,7 +131,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         return await _move(service, params, relative=True)
 
     async def home(_caller: Caller, params: dict[str, Any]) -> Value:
-        named = params["axes"].upper()
+        named = _axes_of(params["axes"])
         _idle_motion(service)
         work = LinesWork([f"G28 {' '.join(named)}"], name="move.home")
         return _answer((await _done(service, service.ready_motion(), work)).output)
@@ -239,6 +241,14 @@ def _lines(script: str) -> list[str]:
     if not any(line.strip() for line in lines):
         raise ApiError("bad_params", "gcode.run: script has no line")
     return lines
+
+
+def _axes_of(letters: str) -> str:
+    """Return LETTERS of axes in capitals; raises ApiError for anything else: it would become g-code."""
+    named = letters.upper() if letters.isascii() else "?"
+    if len(set(named)) < len(named) or not set(named) <= set(HOMED_AXES):
+        raise ApiError("bad_params", f"axes is {shown(letters)}; give letters of {HOMED_AXES}, each once")
+    return named
 
 
 def _who_stops(_caller: Caller, params: dict[str, Any]) -> str | None:
