@@ -69,7 +69,9 @@ class _Timer:
 
     def close(self) -> None:
         """Let go of it."""
-        os.close(self._fd)
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
 
 
 class _WatchedSelector(selectors.DefaultSelector):
@@ -80,6 +82,10 @@ class _WatchedSelector(selectors.DefaultSelector):
         self.timer = _Timer(LOOK_S, AGAIN_S)
         self.busy_since_s = 0.0
         """When the loop began to work; 0: it rests."""
+
+    def close(self) -> None:
+        super().close()
+        self.timer.close()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         self.busy_since_s = 0.0
@@ -129,6 +135,9 @@ class LoopWatchdog:
         self._left_out = 0
         self._seen_s = 0.0
         self._stuck_s = 0.0
+        self._cpu_clock = time.pthread_getcpuclockid(self._loop_thread)
+        self._first = (0.0, 0.0, 0.0)
+        """Of the hold at hand: since when, when it was looked at first, the loop's processor time then."""
 
     def start(self) -> None:
         """Begin to watch."""
@@ -157,6 +166,8 @@ class LoopWatchdog:
     def _look(self, since_s: float) -> None:
         """Report a hold that began at SINCE_S, once."""
         now_s = time.monotonic()
+        if self._first[0] != since_s:
+            self._first = (since_s, now_s, time.clock_gettime(self._cpu_clock))
         if now_s - since_s >= STUCK_S and self._stuck_s != since_s:
             self._stuck_s = since_s
             sys.stderr.write(f"canductor: the control loop is held for {STUCK_S:g} s by {self._where()}\n")
@@ -168,7 +179,12 @@ class LoopWatchdog:
             return
         where = self._where()
         self._reported_s, left_out, self._left_out = now_s, self._left_out, 0
-        more = f"; {left_out} times more since the last report" if left_out else ""
+        _, first_s, cpu_s = self._first
+        calculated_ms = (time.clock_gettime(self._cpu_clock) - cpu_s) * 1e3
+        more = (
+            f"; it calculated for {calculated_ms:.0f} of {(now_s - first_s) * 1e3:.0f} ms that were looked at"
+        )
+        more += f"; {left_out} times more since the last report" if left_out else ""
         try:
             self._loop.call_soon_threadsafe(self._tell, since_s, where, more)
         except RuntimeError:  # the loop has ended
@@ -184,9 +200,10 @@ class LoopWatchdog:
 
 def stack_of(frame: FrameType | None) -> str:
     """Return the innermost functions that FRAME stands in, the last one first, without asyncio's own."""
-    calls = [
-        f"{call.name} ({'/'.join(call.filename.split('/')[-2:])}:{call.lineno})"
-        for call in reversed(traceback.extract_stack(frame))
-        if "/asyncio/" not in call.filename
-    ]
+    calls = []
+    for call in reversed(traceback.extract_stack(frame)):
+        if call.name == "_run_once":
+            break  # the rest is who runs the loop
+        if "/asyncio/" not in call.filename:
+            calls.append(f"{call.name} ({'/'.join(call.filename.split('/')[-2:])}:{call.lineno})")
     return " < ".join(calls[:FRAMES_MAX]) or "asyncio itself"

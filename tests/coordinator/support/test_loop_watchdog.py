@@ -60,6 +60,8 @@ def test_who_holds_the_loop_is_named_and_others_are_counted() -> None:
     assert report.startswith("the control loop was held for ")
     assert "hold_the_loop (support/test_loop_watchdog.py:" in report
     assert "asyncio/" not in report
+    assert "main (" not in report, "nor who runs the loop"
+    assert "it calculated for " in report
     assert threading.get_ident() not in watched.threads
 
 
