@@ -77,7 +77,7 @@ class _Process:
 
     def __init__(self) -> None:
         self._channel, theirs = socket.socketpair()
-        with theirs:
+        try:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "coordinator.gcode.templates.worker"],
                 stdin=theirs.fileno(),
@@ -86,6 +86,11 @@ class _Process:
                 env={**os.environ, "PYTHONPATH": str(_ROOT), "PYTHONHASHSEED": "0"},
                 start_new_session=True,  # Ctrl-C is for the program
             )
+        except OSError:
+            self._channel.close()
+            raise
+        finally:
+            theirs.close()
         self._channel.settimeout(WAIT_S)
         self._poll = select.poll()
         self._poll.register(self._channel, select.POLLIN)
@@ -276,7 +281,11 @@ class TemplateRenderer:
         if process is not None and len(process.numbers) >= TEMPLATES_MAX:
             process.close()
         if process is None or process.ended:
-            process = self._process = _Process()
+            try:
+                process = self._process = _Process()
+            except OSError as error:
+                problem = f"the process that renders templates cannot be started: {error.strerror}"
+                raise RenderingFailed(1, problem) from None
         return process
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from coordinator.gcode.place import Place
 from coordinator.gcode.templates.messages import JSON_BYTES_MAX, BadAnswer, encode_answer, read_answer
+from coordinator.gcode.templates.renderer import RenderingFailed, TemplateRenderer
 from coordinator.gcode.templates.templates import Template, TemplateError
 from tests.coordinator.gcode.templates.attacks import ATTACKS, SENTENCES
 from tests.coordinator.gcode.templates.workers import children
@@ -152,3 +153,11 @@ def test_a_plan_without_macros_starts_no_worker(tmp_path: Path) -> None:
         "assert len(children()) == 1\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, stdout=subprocess.DEVNULL, env=os.environ)
+
+
+def test_a_worker_that_cannot_be_started_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    renderer = TemplateRenderer()
+    with pytest.raises(RenderingFailed, match="cannot be started: No such file or directory"):
+        renderer.render("{ 1 }", {}, {})
+    renderer.close()
