@@ -10,6 +10,7 @@ from pathlib import Path
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
+from coordinator.front_ends.stop_path import StopPath
 from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
 from coordinator.ipc.discovery.announcer_process import AnnouncerProcess
 from coordinator.ipc.protocol.methods import Registry, Scope
@@ -17,6 +18,7 @@ from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.session_methods import API_VERSION
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
+from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.tcp_listener import raise_files_limit
 from coordinator.ipc.server.uploads import upload_method
 from coordinator.klippy_api.gateway import Gateway
@@ -27,6 +29,7 @@ from coordinator.service.core.machine_service import MachineService, ServiceSett
 from coordinator.service.core.typed import Typed
 from coordinator.service.state.log_ring import Entry
 from coordinator.support.interrupts import run_to_end
+from coordinator.support.loop_watchdog import WatchedLoop
 from coordinator.support.report import PlainReport, Report
 from coordinator.support.values import Value
 from coordinator.support.version import version
@@ -91,7 +94,7 @@ def serve(
     raise_files_limit()
     process = _ServiceProcess(load, options, cache)
     try:
-        run_to_end(process.serve)
+        run_to_end(process.serve, WatchedLoop)
     except KeyboardInterrupt:
         if process.cut_off:
             raise
@@ -137,14 +140,17 @@ class _ServiceProcess:
         add_methods(service, registry)
         if settings.jobs is not None:
             registry.add(upload_method(settings.jobs))
+        stop_path = StopPath(service)
         self._server = IpcServer(
             registry,
             tree,
             _ipc_settings(self._options, self.path),
             on_notice=lambda text: service.log.add("notice", text),
+            stop_lane=stop_path.lane,
         )
         page = self._page(registry, service)
         async with contextlib.AsyncExitStack() as stack:
+            stack.callback(stop_path.close)
             if page is not None:
                 stack.push_async_callback(page.close)
             stack.push_async_callback(self._server.close)  # before the page, whose browsers get the reason so
@@ -153,10 +159,13 @@ class _ServiceProcess:
                 await page.start()
             self._report_addresses(page)
             await self._open_metrics(tree, stack)
-            await self._open_klippy_api(service, stack)
+            await self._open_klippy_api(service, stop_path.lane, stack)
             self._announce(service, stack)
             if sys.stdin is not None and sys.stdin.isatty():
-                stack.callback(Typed(service, _print).close)
+                typed = Typed(service, _print)
+                stack.callback(typed.close)
+                stop_path.lane.look_also(typed.find_stop)
+            stop_path.start()
             try:
                 await service.run()
             finally:
@@ -174,13 +183,18 @@ class _ServiceProcess:
                 " it works once, 'canductor page' prints another"
             )
 
-    async def _open_klippy_api(self, service: MachineService, stack: contextlib.AsyncExitStack) -> None:
+    async def _open_klippy_api(
+        self, service: MachineService, stop_lane: StopLane, stack: contextlib.AsyncExitStack
+    ) -> None:
         """Serve Moonraker if asked for; raises CanductorError."""
         path = self._options.klippy_api
         if path is None:
             return
         self._gateway = Gateway(
-            service, self._options.config, on_notice=lambda text: service.log.add("notice", text)
+            service,
+            self._options.config,
+            on_notice=lambda text: service.log.add("notice", text),
+            stop_lane=stop_lane,
         )
         await self._gateway.start(path)
         stack.push_async_callback(self._gateway.close)

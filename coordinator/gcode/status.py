@@ -1,19 +1,11 @@
 """How a program's moves stand while it is read, for macros: ``printer.toolhead``, ``printer.gcode_move``."""
 
 from collections.abc import Mapping
-from typing import NamedTuple, cast
+from typing import cast
 
 from coordinator.gcode.machine_state import MachineState
+from coordinator.gcode.place import Place
 from coordinator.motion.planner.planner import Planner
-
-
-class Place(NamedTuple):
-    """A position by its letters, mm."""
-
-    x: float
-    y: float
-    z: float
-    e: float
 
 
 def motion_figures(planner: Planner, machine: MachineState) -> Mapping[str, Mapping[str, object]]:

@@ -1,5 +1,6 @@
 """One client of the API: what it has sent and nobody has looked at yet, and what it listens to; no I/O."""
 
+import contextlib
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
@@ -69,6 +70,21 @@ class Client:
         except UnreadableError:
             self.dropped += 1
             raise
+
+    def unread_calls(self, unread: bytes) -> list[Request]:
+        """Return the calls that may stop the machine, of those that wait and in UNREAD; in any thread."""
+        if self.fault is not None:
+            return []
+        try:
+            bodies = self._framer.copy().feed(unread)
+        except TooLongError:
+            return []
+        found = []
+        for body in (*self._urgent, *self._waiting, *bodies):
+            if is_urgent(body):
+                with contextlib.suppress(UnreadableError):
+                    found.append(read_request(body))
+        return found
 
     def register(self, name: str, template: Mapping[str, Any]) -> bool:
         """Remember a remote method; return whether there was room."""

@@ -208,6 +208,15 @@ class Endpoints:
         self._registered()
         return {}
 
+    def stops(self, request: Request) -> str | None:
+        """Return who stops the machine with REQUEST; None: it does not. In any thread."""
+        if request.method == "emergency_stop":
+            return WHO
+        script = request.params.get("script")
+        if request.method == "gcode/script" and isinstance(script, str) and _EMERGENCY.search(script):
+            return f"M112 of {WHO}"
+        return None
+
     def _emergency_stop(self, _client: Client, _request: Request) -> Result:
         self._service.emergency_stop(WHO)
         return {}

@@ -2,12 +2,14 @@
 
 import asyncio
 import contextlib
+import socket
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.ipc.server.fair_scheduler import FairScheduler
+from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
@@ -53,6 +55,7 @@ class Connection(asyncio.BufferedProtocol):
         pid, uid = (0, None) if opened is None else peer_of(opened)
         self.client = Client("a client" if uid is None else f"the client with pid {pid}")
         self._gateway.admit(self, uid)
+        self._gateway.watch_stops(self, opened)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the client; what it has begun goes on."""
@@ -137,8 +140,16 @@ class Gateway:
     ON_NOTICE gets sentences for the machine's owner.
     """
 
-    def __init__(self, service: "MachineService", config: Path, *, on_notice: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        service: "MachineService",
+        config: Path,
+        *,
+        on_notice: Callable[[str], None],
+        stop_lane: StopLane | None = None,
+    ) -> None:
         self.notice = on_notice
+        self._stop_lane = stop_lane
         self.endpoints = Endpoints(service, config, self.say, self.registered)
         service.programs.on_remote = self._call_remote
         self._service = service
@@ -158,9 +169,10 @@ class Gateway:
         if path is not None:
             listener = await listen_at(path)
             self._path = path
-            self._server = await asyncio.get_running_loop().create_unix_server(
-                self.make_connection, sock=listener, backlog=BACKLOG
-            )
+            loop = asyncio.get_running_loop()
+            self._server = await loop.create_unix_server(self.make_connection, sock=listener, backlog=BACKLOG)
+            if self._stop_lane is not None:
+                self._stop_lane.listen(listener, loop, self.make_connection, self._find_stop_of_new)
         self._updates = asyncio.get_running_loop().create_task(self._update())
 
     async def close(self) -> None:
@@ -209,9 +221,24 @@ class Gateway:
         elif len(self._connections) > CLIENTS_MAX:
             connection.drop(f"there are {CLIENTS_MAX} clients already")
 
+    def watch_stops(self, connection: Connection, opened: socket.socket | None) -> None:
+        """Look for stops in what the socket of CONNECTION has unread, while the loop is held."""
+        if self._stop_lane is not None and opened is not None and connection in self._connections:
+            client = connection.client
+            self._stop_lane.watch(connection, opened, lambda unread: self._find_stop(client, unread))
+
+    def _find_stop(self, client: Client, unread: bytes) -> str | None:
+        stops = (self.endpoints.stops(request) for request in client.unread_calls(unread))
+        return next((who for who in stops if who is not None), None)
+
+    def _find_stop_of_new(self, opened: socket.socket, unread: bytes) -> str | None:
+        return self._find_stop(Client(""), unread) if may_use(peer_of(opened)[1]) else None
+
     def forget(self, connection: Connection) -> None:
         """Take note that CONNECTION is over."""
         self._connections.pop(connection, None)
+        if self._stop_lane is not None:
+            self._stop_lane.forget(connection)
         self.registered()
 
     def call(self, connection: Connection, request: Request) -> None:

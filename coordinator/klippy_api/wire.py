@@ -17,8 +17,8 @@ END: Final = b"\x03"
 MESSAGE_BYTES_MAX: Final = 262_144
 """One message of a client, without its end."""
 LIMITS: Final = Limits(nesting=64, items=8_192)
-URGENT: Final = (b"emergency_stop", b"M112")
-"""A message with one of these words overtakes all others that wait."""
+URGENT: Final = (b"EMERGENCY_STOP", b"M112")
+"""A message with one of these words, in capitals or not, overtakes all others that wait."""
 
 
 class TooLongError(CanductorError):
@@ -46,6 +46,12 @@ class Framer:
         self._rest = bytearray()
         self._scanned = 0
 
+    def copy(self) -> "Framer":
+        """Return one that has what this one has and goes on by itself; from any thread."""
+        twin = Framer()
+        twin._rest = self._rest[:]
+        return twin
+
     def feed(self, data: bytes | memoryview) -> list[bytes]:
         """Return the messages that DATA completes; raises TooLongError."""
         self._rest += data
@@ -65,7 +71,8 @@ class Framer:
 
 def is_urgent(body: bytes) -> bool:
     """Return whether BODY may be a call that stops the machine."""
-    return any(word in body for word in URGENT)
+    capitals = body.upper()
+    return any(word in capitals for word in URGENT)
 
 
 def read_request(body: bytes) -> Request:

@@ -196,10 +196,18 @@ class Machine:
         self.stopped = MachineStopped(cause)
         self._stopped_at_ns = self.host.now()
         self._recovery.halt()
-        for opened in self._open:
-            opened.bus.emergency_stop()
+        self.stop_nodes()
         self._failed.set()
         self.modules.stopped(cause)
+
+    def stop_nodes(self) -> None:
+        """Send the emergency stop to every node that can be reached; from any thread.
+
+        What else a stop is (``stop``) is up to the loop, when it can.
+        """
+        for opened in tuple(self._open):
+            with contextlib.suppress(CanductorError):  # the other buses must not miss it
+                opened.bus.emergency_stop()
 
     async def sleep(self, name: str) -> None:
         """Disconnect node NAME, so that its power can be switched off; it is not missed until ``wake``.

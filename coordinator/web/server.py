@@ -22,6 +22,7 @@ from coordinator.web.http_server import HttpServer
 from coordinator.web.names import is_known_host, is_own_origin
 from coordinator.web.session_file import read_sessions, write_sessions
 from coordinator.web.settings import WebSettings
+from coordinator.web.websocket_frames import lines_in
 from coordinator.web.websocket_transport import WebSocketTransport
 from nodes.support.errors import CanductorError
 
@@ -252,10 +253,12 @@ class WebServer:
             await self._save_sessions()
         await socket.prepare(request)
         HttpServer.keep(request)
-        await self._relay(socket, _address(request), session)
+        await self._relay(socket, request, session)
         return socket
 
-    async def _relay(self, socket: web.WebSocketResponse, address: str, session: PageSession) -> None:
+    async def _relay(
+        self, socket: web.WebSocketResponse, request: web.BaseRequest, session: PageSession
+    ) -> None:
         """Carry messages both ways until one side ends."""
 
         def check_key(key: str) -> ExternalGrant | None:
@@ -265,8 +268,11 @@ class WebServer:
             return ExternalGrant(grant, session.token)
 
         transport = WebSocketTransport(socket)
-        connection = self._ipc.adopt(transport, address, check_key)
+        connection = self._ipc.adopt(transport, _address(request), check_key)
         transport.connection = connection
+        self._ipc.watch_stops(
+            connection, request.transport, lambda unread: connection.session.find_stop(lines_in(unread))
+        )
         self._clients[connection] = session
         sending = asyncio.ensure_future(transport.run())
         begun = False

@@ -150,7 +150,7 @@ class BusBase:
         self._close_io()
 
     def emergency_stop(self) -> None:
-        """Stop every node that can be reached."""
+        """Stop every node that can be reached; from any thread."""
         for node in self.nodes:
             node.emergency_stop()
 

@@ -33,7 +33,7 @@ class LinkIO:
     first, then the transport. LinkIO.driven_by() uses a bus with another driver, for example a simulation.
     ON_FRAME gets CAN frames that belong to no link, ON_CLOSED one sentence when the transport ends by itself.
     SETTINGS define what the bus can carry; without them a CAN transport's bit rate counts, if it is known.
-    Not thread-safe: use from the loop's thread.
+    Not thread-safe: use from the loop's thread, but for ``send_frame`` and ``Link.send_urgent``.
     """
 
     def __init__(
@@ -124,8 +124,13 @@ class LinkIO:
             self._lib.io_set_bitrate(self._bus.live(), bitrate)
 
     def send_frame(self, can_id: int, data: bytes) -> None:
-        """Send one CAN frame that belongs to no link, before all data. Raises LinkError when that fails."""
-        status = self._lib.io_send_frame(self._bus.live(), can_id, self._ffi.from_buffer(data), len(data))
+        """Send one CAN frame that belongs to no link, before all data; from any thread.
+
+        Raises LinkError when that fails.
+        """
+        content = self._ffi.from_buffer(data)
+        with self._bus.lock:
+            status = self._lib.io_send_frame(self._bus.live(), can_id, content, len(data))
         if status == self._lib.IO_INVALID:
             raise LinkError(
                 f"{self.name}: a frame of {len(data)} bytes; CAN frames have 0..8, serial lines none"

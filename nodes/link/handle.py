@@ -2,6 +2,7 @@
 
 import errno
 import os
+import threading
 from typing import Any
 
 from nodes.link.types import BusDriver, LinkError
@@ -23,6 +24,8 @@ class BusHandle:
         self.ffi = driver.ffi
         self.lib = driver.lib
         self._bus: Any = driver.bus
+        self.lock = threading.RLock()
+        """Held by calls that other threads than the loop's may make, and while the driver is closed."""
 
     @property
     def open(self) -> bool:
@@ -37,8 +40,9 @@ class BusHandle:
 
     def close(self) -> None:
         """End the driver, which frees the bus."""
-        self._bus = None
-        self._driver.close()
+        with self.lock:
+            self._bus = None
+            self._driver.close()
 
     def ended_because(self, cause: int) -> str:
         """Return one sentence for a transport that ended by itself; CAUSE is an errno, or 0."""

@@ -76,10 +76,14 @@ class Link:
         self._check(status)
 
     def send_urgent(self, content: bytes) -> None:
-        """Drop everything that is queued but unsent and send CONTENT next; raises LinkError as send()."""
-        status = self._lib.io_send_urgent(
-            self._live(), self._number, self._ffi.from_buffer(content), len(content)
-        )
+        """Drop everything that is queued but unsent and send CONTENT next; raises LinkError as send().
+
+        From any thread: an emergency stop does not wait for the loop.
+        """
+        with self._bus.lock:
+            status = self._lib.io_send_urgent(
+                self._live(), self._number, self._ffi.from_buffer(content), len(content)
+            )
         self._check_command(status, len(content))
 
     def set_receive_window(self, size: int) -> None:

@@ -197,7 +197,10 @@ class Node:
         self._explain.append(explain)
 
     def emergency_stop(self) -> None:
-        """Stop the node ahead of everything queued for it; no effect on a node that cannot be reached."""
+        """Stop the node ahead of everything queued for it; no effect on a node that cannot be reached.
+
+        From any thread.
+        """
         if self._talk.connected and "emergency_stop" in self.dictionary.commands:
             # The link may already have lost the node without the loop having been notified.
             with contextlib.suppress(CanductorError):

@@ -6,7 +6,9 @@ import pytest
 
 from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.service.core.machine_service import ServiceState
 from coordinator.service.jobs.forward import read_forward
+from tests.coordinator.gcode.templates.attacks import ATTACKS
 from tests.stages.printer import Printer, gcode
 from tests.stages.served import Served
 
@@ -95,5 +97,26 @@ def test_a_print_with_all_of_them(tmp_path: Path) -> None:
 
         with pytest.raises(ApiError, match="client:1: EXTRUDER_TEMP=295 is too close to the limit of 300"):
             await gcode(stage, "PRINT_START EXTRUDER_TEMP=295")
+
+    printer.serve(go)
+
+
+def test_a_macro_that_calculates_for_ever_ends_and_the_printer_goes_on(tmp_path: Path) -> None:
+    attack = ATTACKS["nested comparison"]
+    printer = Printer(
+        tmp_path, f"[gcode_macro HOLD]\ngcode:\n    {attack}\n[gcode_macro FINE]\ngcode:\n    G28\n"
+    )
+
+    async def go(stage: Served) -> None:
+        await gcode(stage, "M104 S60", "G28")
+        with pytest.raises(ApiError, match=r"printer.cfg:\d+: \[gcode_macro HOLD\]: it takes more than"):
+            await gcode(stage, "HOLD")
+        assert printer.status("extruder")["target"] == 60
+        stage.write_job("G1 X50 F6000\nHOLD\nG1 X100\n")
+        await stage.call("job.start", file="job.gcode")
+        await stage.until_job("failed")
+        assert stage.planned[0] == pytest.approx(50)
+        await gcode(stage, "FINE")
+        assert stage.service.state is ServiceState.READY
 
     printer.serve(go)

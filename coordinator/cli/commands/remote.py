@@ -72,7 +72,7 @@ def _send(given: argparse.Namespace) -> PlainReport:
 
 
 def _estop(given: argparse.Namespace) -> PlainReport:
-    result = target_of(given).call("machine.emergency_stop")
+    result = target_of(given).call_first("machine.emergency_stop")
     return PlainReport({"result": result}, "stopped: every node was ordered to shut down")
 
 

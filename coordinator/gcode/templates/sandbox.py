@@ -2,7 +2,8 @@
 
 A template comes from the user's own configuration, but a mistake in it must not stop a machine that prints:
 every turn of a loop and every call is counted, and nothing it builds may grow beyond MAX_CHARS. Operations
-that could make something huge in a single step are looked at before they are done.
+that could make something huge in a single step are looked at before they are done. These bounds give a
+sentence with the template's line; what they miss ends at the limits of the process (worker.py, renderer.py).
 """
 
 import functools
@@ -13,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Final
 
-from jinja2 import TemplateSyntaxError, nodes
+from jinja2 import TemplateSyntaxError, nodes, pass_context
 from jinja2.runtime import Context
 from jinja2.sandbox import SandboxedEnvironment
 from jinja2.visitor import NodeTransformer
@@ -22,8 +23,9 @@ MAX_TURNS: Final = 100_000
 """Turns of loops and calls of one rendering."""
 MAX_CHARS: Final = 1_000_000
 """Of what is rendered, and of anything a template builds."""
-MAX_CPU_S: Final = 1.0
-"""Time of the processor that one rendering may take; moves are planned no more than that ahead."""
+MAX_CPU_S: Final = 0.2
+"""Time of the processor after which a rendering ends itself, with the line where it was. What does not count
+its steps (one call that takes long) is ended from outside, a little later (renderer.py)."""
 MAX_WIDTH: Final = 10_000
 """Of padding, indentation and the like."""
 _MAX_BITS: Final = 4096
@@ -54,7 +56,7 @@ class Meter:
         if self._turns > MAX_TURNS:
             raise TooMuch(f"more than {MAX_TURNS} turns of loops and calls; does a loop not end?")
         if before // _CHECKED_TURNS != self._turns // _CHECKED_TURNS and time.thread_time() > self._until_s:
-            raise TooMuch(f"it takes more than {MAX_CPU_S:g} s; have it do less")
+            raise TooMuch(f"it takes more than {MAX_CPU_S:g} s of processor time; have it do less")
 
     def text(self, chars: int) -> None:
         """Count characters that are rendered."""
@@ -105,6 +107,7 @@ class Sandbox(SandboxedEnvironment):
             finalize=self._output,
             extensions=["jinja2.ext.do"],
             cache_size=0,
+            optimized=False,  # nothing of a template is calculated while it is compiled
         )
         self._of_thread = threading.local()
         self.globals.pop("lipsum", None)
@@ -174,7 +177,8 @@ class Sandbox(SandboxedEnvironment):
                 _check_size(_size(part) * (times if isinstance(times, int) else 0))
         return super().call_binop(context, operator, left, right)
 
-    def _output(self, value: object) -> str:
+    @pass_context
+    def _output(self, _context: Context, value: object) -> str:
         text = str(value)
         if self.meter is not None:
             self.meter.text(len(text))

@@ -47,8 +47,9 @@ class Client:
     """The machine at ADDRESS (see ``read_address``): ``async with Client(…) as client``.
 
     It lives on the loop that enters it. TLS: None trusts the certificates that this computer trusts.
-    TIMEOUT_S: for connecting, and for calls while there is no connection. Raises CanductorError for an
-    invalid address; entering raises it when no machine answers there.
+    TIMEOUT_S: for connecting, and for calls while there is no connection. FIRST: a method that is called
+    without waiting for the answer to the hello, so that an emergency stop is there even when nobody reads.
+    Raises CanductorError for an invalid address; entering raises it when no machine answers there.
 
     When the connection is lost, calls under way raise ConnectionLost; watches and notifications go on as soon
     as the machine is back, watches with a snapshot; new calls wait for that, up to TIMEOUT_S.
@@ -64,7 +65,11 @@ class Client:
         tls: ssl.SSLContext | None = None,
         encoding: Encoding = Encoding.MSGPACK,
         timeout_s: float = 5.0,
+        first: str | None = None,
     ) -> None:
+        self.first: asyncio.Task[Any] | None = None
+        """The answer to the call that was sent right behind the hello."""
+        self._first = first
         self.address = read_address(address)
         self.hello: Hello | None = None
         """Of the connection that is open; None while there is none."""
@@ -223,6 +228,9 @@ class Client:
             raise ConnectionLost(connect_error_sentence(address, error)) from None
         self._wire = WireReader(LIMITS, checked=False)
         hello = asyncio.create_task(self._ask("api.hello", self._hello_params))
+        if self._first is not None:
+            self.first = asyncio.create_task(self._ask(self._first, {}))
+            self._first = None
         try:
             while not hello.done():
                 await self._read_some(tls_hint(address))

@@ -41,6 +41,16 @@ class Target:
         """Call METHOD with PARAMS and return its result; raises CanductorError."""
         return self.run(lambda client: client.call(method, params))
 
+    def call_first(self, method: str) -> Any:
+        """Call METHOD in the first bytes of the connection; raises CanductorError."""
+
+        async def main() -> Any:
+            async with Client(self.address, first=method, **self.settings("canductor")) as client:
+                assert client.first is not None
+                return await client.first
+
+        return run_to_end(main)
+
     def run(self, body: Callable[[Client], Awaitable[T]]) -> T:
         """Run BODY with a connected client, on its own loop; Ctrl-C cancels it. Raises CanductorError."""
 

@@ -94,6 +94,13 @@ class WireReader:
         self._begun_s: float | None = None  # since when a message is incomplete
         self._end_reason: EndReason | None = None
 
+    def copy(self) -> "WireReader":
+        """Return a reader that has what this one has and goes on by itself; from any thread."""
+        twin = WireReader(self._limits, checked=self._checked)
+        twin.encoding, twin.message_bytes_max = self.encoding, self.message_bytes_max
+        twin._buffer = self._buffer[:]
+        return twin
+
     def feed(self, data: bytes | memoryview, now_s: float) -> None:
         """Take DATA that has arrived."""
         self._fed_s = now_s

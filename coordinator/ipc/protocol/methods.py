@@ -123,6 +123,9 @@ class Method:
     urgent: bool = False
     """Called while the message is received, ahead of everything that waits, and whatever is wrong with its
     parameters; must be a plain function, and require none."""
+    stops: Callable[[Caller, dict[str, Any]], str | None] = lambda _caller, _params: None
+    """Return whom a call with such parameters names as who stops the machine; None: it does not. In any
+    thread: while the control loop is held, such a call is carried out without it (server/stop_lane.py)."""
 
     def schema(self) -> dict[str, Value]:
         """Return the declaration as "api.methods" shows it."""

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import socket
 import ssl
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -20,6 +21,7 @@ from coordinator.ipc.server.session import Session, SessionContext, SessionCount
 from coordinator.ipc.server.session_methods import add_session_methods
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
+from coordinator.ipc.server.stop_lane import FindStop, StopLane
 from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, TcpListener
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.support.values import Value
@@ -47,7 +49,7 @@ def _ignore(_: str) -> None:
 class IpcServer:
     """Serves the methods of REGISTRY, and STATE, to front ends; lives on the loop that starts it.
 
-    ON_NOTICE gets sentences for the machine's owner.
+    ON_NOTICE gets sentences for the machine's owner. STOP_LANE finds emergency stops while the loop is held.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class IpcServer:
         settings: IpcSettings,
         *,
         on_notice: Callable[[str], None] = _ignore,
+        stop_lane: StopLane | None = None,
     ) -> None:
         add_session_methods(registry)
         self._settings = settings
@@ -71,6 +74,7 @@ class IpcServer:
         self._digests: dict[Connection, bytes] = {}  # digests of the tokens that clients came in with
         self._tcp: set[Connection] = set()
         """Connections that count against ``tcp_connections_max``."""
+        self._stop_lane = stop_lane
         self._watch: asyncio.Task[None] | None = None
         self._scheduler: FairScheduler | None = None
         self._sessions = 0
@@ -153,10 +157,15 @@ class IpcServer:
 
     async def _open_unix(self, path: Path, scheduler: FairScheduler) -> None:
         listener = await listen_at(path)
-        server = await asyncio.get_running_loop().create_unix_server(
-            lambda: Connection(self._admit_unix, self._drop, scheduler), sock=listener, backlog=BACKLOG
-        )
+        loop = asyncio.get_running_loop()
+
+        def make() -> Connection:
+            return Connection(self._admit_unix, self._drop, scheduler)
+
+        server = await loop.create_unix_server(make, sock=listener, backlog=BACKLOG)
         self._servers.append(server)
+        if self._stop_lane is not None:
+            self._stop_lane.listen(listener, loop, make, self._find_stop)
 
     async def _open_tcp(self, tcp: TcpSettings, scheduler: FairScheduler) -> None:
         context = await asyncio.to_thread(_tls_of_tcp, tcp)
@@ -176,6 +185,16 @@ class IpcServer:
             ) from None
         self.tcp_port = listener.addresses[0][1]
         self.tcp_addresses = [address for address, _ in listener.addresses]
+
+    def watch_stops(
+        self, connection: Connection, transport: asyncio.BaseTransport | None, find_stop: FindStop
+    ) -> None:
+        """Look for stops of CONNECTION in what TRANSPORT has unread, while the loop is held; not with TLS."""
+        opened = None if transport is None else transport.get_extra_info("socket")
+        if self._stop_lane is None or transport is None or opened is None:
+            return
+        if transport.get_extra_info("sslcontext") is None:
+            self._stop_lane.watch(connection, opened, find_stop)
 
     # ----------------------------------------------------------------------------------------- tokens
 
@@ -283,6 +302,16 @@ class IpcServer:
         self._tcp.add(connection)
         return session
 
+    def _find_stop(self, opened: socket.socket, unread: bytes) -> str | None:
+        """Return who stops the machine with the UNREAD bytes of a new connection over the Unix socket."""
+        pid, uid = peer_of(opened)
+        if not may_use(uid):
+            return None
+        session = Session(
+            self._context, 0.0, number=0, peer=f"uid {uid}, pid {pid}", granted=self._settings.unix_scope
+        )
+        return session.find_stop(unread)
+
     def _token_check(self, connection: Connection, address: str) -> Callable[[str], Grant | None]:
         """Return what looks at the token of CONNECTION's hello; failures count for ADDRESS, if it has one."""
 
@@ -301,6 +330,7 @@ class IpcServer:
             self._context, now_s, number=self._sessions, peer=peer, granted=None, check_token=check
         )
         self._connections.add(connection)
+        self.watch_stops(connection, connection.transport, session.find_stop)
         if len(self._connections) > self._settings.connections_max:
             self._refuse(session, EndReason("busy", "there are too many connections; close others"))
         if len(self._connections) > self._settings.connections_max + REFUSALS_MAX:
@@ -315,6 +345,8 @@ class IpcServer:
         self._connections.discard(connection)
         self._tcp.discard(connection)
         self._digests.pop(connection, None)
+        if self._stop_lane is not None:
+            self._stop_lane.forget(connection)
         for field in fields(SessionCounters):
             total = getattr(self._closed_totals, field.name) + getattr(
                 connection.session.counters, field.name

@@ -207,6 +207,32 @@ class Session:
         self.subscriptions.clear()
         self._send({"error": {"code": reason.code, "message": reason.sentence}})
 
+    # ------------------------------------------------------------------------------ while the loop is held
+
+    def find_stop(self, unread: bytes) -> str | None:
+        """Return who stops the machine with what waits here and with the UNREAD bytes behind it; else None.
+
+        In any thread; the session stays as it is. A twin of it reads the bytes, so that rights are the same.
+        """
+        if self.end_reason is not None or not (unread or self._reader.waiting_bytes or self._waiting):
+            return None
+        twin = Session(self.context, 0.0, number=self.number, peer=self.peer, granted=self.granted)
+        twin.caller, twin._reader = self.caller, self._reader.copy()
+        twin._reader.feed(unread, 0.0)
+        waiting = tuple(self._waiting)
+        while True:
+            before = twin._reader.waiting_bytes
+            waiting = (*twin.read(0.0), *waiting, *twin._waiting)
+            for request in waiting:
+                assert twin.caller is not None
+                if (who := request.method.stops(twin.caller, request.params)) is not None:
+                    return who
+            waiting = ()
+            twin._waiting.clear()
+            twin._ids.clear()
+            if twin.end_reason is not None or twin._reader.waiting_bytes == before:
+                return None
+
     # --------------------------------------------------------------------------------------- requests
 
     def read(self, now_s: float) -> list[Request]:

@@ -10,6 +10,7 @@ from coordinator.config.options import GCodeOption, Option, SectionSpec, TextOpt
 from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
 from coordinator.gcode.parameters import needed, one
 from coordinator.gcode.parser import Command, WordError, parse, quoted
+from coordinator.gcode.templates.renderer import Actions
 from coordinator.gcode.templates.templates import Asked, Template, TemplateError, line_of
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.printer_status import PrinterStatus
@@ -52,44 +53,36 @@ class GCodeTemplate:
         except TemplateError as error:
             place = Place(self._path, line_of(self._numbers, error.line))
             raise ConfigError(place, f"the template of [{build.name}]: {error}") from None
+        if not self._template.plain:
+            self._status.add_template(text)
 
     def lines(self, call: Call, values: Mapping[str, object]) -> Lines:
         """Render it for CALL with further VALUES; raises WordError."""
-        replies: list[str] = []
-
-        def respond(text: object) -> str:
-            replies.append(str(text))
-            return ""
-
-        def fail(text: object) -> str:
-            raise Asked(str(text))
-
-        def call_remote(method: object, **values: object) -> str:
-            if not self._status.call_remote(str(method), values):
-                replies.append(f"the remote method {method} was not called: no client has registered one")
-            return ""
-
-        def stop(text: object = "") -> str:
-            raise Asked(str(text), emergency=True)
-
         try:
-            made = self._template.render(
-                {
-                    **values,
-                    "printer": self._status.view(call),
-                    "action_respond_info": respond,
-                    "action_call_remote_method": call_remote,
-                    "action_raise_error": fail,
-                    "action_emergency_stop": stop,
-                }
-            )
+            made = self._template.render(values, self._status.view(call))
         except Asked as asked:
+            replies = self._carry_out(asked.actions)
             if asked.emergency:
                 return Lines("M112", (*replies, *([str(asked)] if str(asked) else [])))
             raise WordError(str(asked)) from None
         except TemplateError as error:
+            self._carry_out(error.actions)
             raise WordError(f"{self._place((error.line,), 1)}: {error}") from None
-        return Lines(made.text, tuple(replies), lambda line: self._place(made.lines, line))
+        return Lines(made.text, self._carry_out(made.actions), lambda line: self._place(made.lines, line))
+
+    def _carry_out(self, actions: Actions) -> tuple[str, ...]:
+        """Call the clients that ACTIONS name; return what is to be shown."""
+        replies: list[str] = []
+        for action in actions:
+            match action:
+                case ("respond", str(text)):
+                    replies.append(text)
+                case ("call", str(method), dict(values)):
+                    if not self._status.call_remote(method, values):
+                        replies.append(
+                            f"the remote method {method} was not called: no client has registered one"
+                        )
+        return tuple(replies)
 
     def _place(self, lines: tuple[int, ...], line: int) -> str:
         """Name where LINE of a rendered text comes from."""

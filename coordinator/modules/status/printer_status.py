@@ -10,9 +10,8 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
-from jinja2 import ChainableUndefined
-
 from coordinator.gcode.commands import Call
+from coordinator.gcode.templates.renderer import template_renderer
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.absent_status import absent_statuses
 from coordinator.modules.status.config_view import config_view
@@ -34,6 +33,11 @@ class PrinterStatus(Module):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_thread = 0
         self._last: Shown = {}
+        self._templates: list[str] = []
+
+    def add_template(self, text: str) -> None:
+        """Have TEXT compiled by the time it is needed."""
+        self._templates.append(text)
 
     def link(self, modules: Modules) -> None:
         """Remember the modules."""
@@ -43,6 +47,8 @@ class PrinterStatus(Module):
         """Start asking the loop."""
         await super().connect(live)
         self._loop, self._loop_thread = asyncio.get_running_loop(), threading.get_ident()
+        if self._templates:
+            template_renderer().prepare(self._templates)
 
     def close(self) -> None:
         """Stop asking the loop."""
@@ -120,31 +126,9 @@ class PrinterView(Mapping[str, Any]):
 
     def _every(self) -> Shown:
         if self._all is None:
-            seen = {name: _copy(status) for name, status in self._look().items()}
-            figures = self._figures()
-            every = {**seen, **{name: {**seen.get(name, {}), **more} for name, more in figures.items()}}
+            seen, figures = self._look(), self._figures()
             self._all = {
-                name: Section(name, status) if isinstance(status, dict) else status
-                for name, status in every.items()
+                **seen,
+                **{name: {**seen.get(name, {}), **told} for name, told in figures.items()},
             }
         return self._all
-
-
-class Section(dict[str, Any]):
-    """The status of a section: fields that it does not have are undefined, and so are their fields."""
-
-    def __init__(self, name: str, status: Mapping[str, Any]) -> None:
-        super().__init__(status)
-        self._name = name
-
-    def __missing__(self, field: str) -> "ChainableUndefined":
-        return ChainableUndefined(f"printer[{self._name!r}] has no {field!r}")
-
-
-def _copy(value: Any) -> Any:
-    """Return VALUE with lists and dicts of its own: a macro may change what it gets."""
-    if isinstance(value, dict):
-        return {key: _copy(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_copy(inner) for inner in value]
-    return value

@@ -45,8 +45,11 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
     def state(_caller: Caller, _params: dict[str, Any]) -> Value:
         return _state(service)
 
+    def who_stops(caller: Caller, params: dict[str, Any]) -> str:
+        return shown(params["who"] or caller.name)
+
     def stop(caller: Caller, params: dict[str, Any]) -> Value:
-        service.emergency_stop(shown(params["who"] or caller.name))
+        service.emergency_stop(who_stops(caller, params))
         return _state(service)
 
     def restart(_caller: Caller, params: dict[str, Any]) -> Value:
@@ -93,6 +96,7 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
             ),
         ),
         urgent=True,
+        stops=who_stops,
     )
     yield Method(
         "machine.restart",

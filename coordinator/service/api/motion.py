@@ -9,7 +9,7 @@ from typing import Any, Final
 from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
 from coordinator.gcode.builtins.machine import is_tool
 from coordinator.gcode.errors import GCodeError
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
 from coordinator.modules.module_set import INTERRUPTING
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.feeder import FeederFull, QueuedWork
@@ -62,6 +62,12 @@ _TOLD: Final = (
 )
 
 
+HOMED_AXES: Final = "XYZ"
+"""Letters that ``move.home`` takes."""
+BY_LINE: Final = f"{EMERGENCY} of a client"
+"""Who stops the machine by a line of g-code."""
+
+
 @dataclass(frozen=True, slots=True)
 class ScriptOutcome:
     """What lines of a client answered."""
@@ -79,7 +85,7 @@ async def run_script(service: MachineService, script: str, *, wait: bool) -> Scr
     lines = _lines(script)
     names = _commands(lines)
     if EMERGENCY in names:
-        service.emergency_stop(f"{EMERGENCY} of a client")
+        service.emergency_stop(BY_LINE)
         return ScriptOutcome()
     if _restarted(service, names):
         return ScriptOutcome()
@@ -125,7 +131,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         return await _move(service, params, relative=True)
 
     async def home(_caller: Caller, params: dict[str, Any]) -> Value:
-        named = params["axes"].upper()
+        named = _axes_of(params["axes"])
         _idle_motion(service)
         work = LinesWork([f"G28 {' '.join(named)}"], name="move.home")
         return _answer((await _done(service, service.ready_motion(), work)).output)
@@ -150,6 +156,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         run,
         params=(Param("script", Kind.STR, "lines", high=LINES_BYTES_MAX), _WAIT),
         returns=_TOLD,
+        stops=_who_stops,
     )
     for name, call, sentence in (
         ("move.to", move_to, "Move straight to a place in the machine's frame, whatever g-code modes hold."),
@@ -235,6 +242,21 @@ def _lines(script: str) -> list[str]:
     if not any(line.strip() for line in lines):
         raise ApiError("bad_params", "gcode.run: script has no line")
     return lines
+
+
+def _axes_of(letters: str) -> str:
+    """Return LETTERS of axes in capitals; raises ApiError for anything else: it would become g-code."""
+    named = letters.upper() if letters.isascii() else "?"
+    if len(set(named)) < len(named) or not set(named) <= set(HOMED_AXES):
+        raise ApiError("bad_params", f"axes is {shown(letters)}; give letters of {HOMED_AXES}, each once")
+    return named
+
+
+def _who_stops(_caller: Caller, params: dict[str, Any]) -> str | None:
+    try:
+        return BY_LINE if EMERGENCY in _commands(_lines(params["script"])) else None
+    except CanductorError:
+        return None
 
 
 def _commands(lines: list[str]) -> list[str]:

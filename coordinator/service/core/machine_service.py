@@ -292,10 +292,9 @@ class MachineService:
         self._enter(ServiceState.SHUTDOWN, cause)
 
     async def _stop_if_moving(self) -> None:
-        machine, motion = self.machine, self.motion
-        if machine is not None and motion is not None and machine.stopped is None and not motion.standing:
-            self.cut_off = True
-            machine.stop(BY_INTERRUPT)
+        machine = self.machine
+        self.cut_off_motion()
+        if self.cut_off and machine is not None:
             await machine.confirm_stop()
 
     async def _let_go(self) -> None:
@@ -315,6 +314,19 @@ class MachineService:
         self.machine.stop(cause)
         if self.motion is not None:
             self._stopped(self.machine)
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything moves, on a machine that was not stopped; from any thread."""
+        machine, motion = self.machine, self.motion
+        return machine is not None and machine.stopped is None and motion is not None and not motion.standing
+
+    def cut_off_motion(self) -> None:
+        """Stop all nodes for Ctrl-C or SIGTERM, if anything moves."""
+        if self.moves:
+            assert self.machine is not None
+            self.cut_off = True
+            self.machine.stop(BY_INTERRUPT)
 
     def restart(self, *, firmware: bool = False) -> None:
         """Restart with the configuration read again; raises ApiError while the machine starts or works.

@@ -2,13 +2,16 @@
 
 import asyncio
 import os
+import select
 import sys
+import threading
 from collections.abc import Callable
 from typing import Final
 
 from coordinator.ipc.protocol.methods import Caller, Registry, Scope
-from coordinator.service.api.motion import motion_methods
+from coordinator.service.api.motion import BY_LINE, motion_methods
 from coordinator.service.core.machine_service import MachineService
+from coordinator.service.core.work import EMERGENCY, commands_in
 from nodes.support.errors import CanductorError
 
 LINES_MAX: Final = 1000
@@ -27,6 +30,10 @@ class Typed:
         self._loop = asyncio.get_running_loop()
         self._fd = sys.stdin.fileno()
         self._rest = b""
+        self._lock = threading.Lock()
+        """Held while the terminal is read, by the loop or by the thread that looks for a stop."""
+        self._typed = b""
+        """Read by that thread; the loop has it next."""
         self._lines: asyncio.Queue[str] = asyncio.Queue(LINES_MAX)
         self._work = asyncio.ensure_future(self._work_off())
         self._loop.add_reader(self._fd, self._read)
@@ -36,10 +43,35 @@ class Typed:
         self._loop.remove_reader(self._fd)
         self._work.cancel()
 
+    def find_stop(self) -> str | None:
+        """Return who stops the machine by a line that was typed while the loop is held; in any thread."""
+        if not self._lock.acquire(blocking=False):  # the loop is just reading, maybe for ever
+            return None
+        try:
+            if _is_readable(self._fd) and (data := os.read(self._fd, _READ_BYTES)):
+                self._typed += data
+                self._loop.call_soon_threadsafe(self._take_typed)
+            lines = (self._rest + self._typed).rpartition(b"\n")[0].decode(errors="replace").splitlines()
+        finally:
+            self._lock.release()
+        return BY_LINE if any(_is_stop(line) for line in lines) else None
+
+    def _take_typed(self) -> None:
+        with self._lock:
+            data, self._typed = self._typed, b""
+            self._take(data)
+
     def _read(self) -> None:
-        data = os.read(self._fd, _READ_BYTES)
-        if not data:
-            self._loop.remove_reader(self._fd)
+        with self._lock:
+            if not _is_readable(self._fd):  # the other thread was faster
+                return
+            data = os.read(self._fd, _READ_BYTES)
+            if not data:
+                self._loop.remove_reader(self._fd)
+            typed, self._typed = self._typed, b""
+            self._take(typed + data)
+
+    def _take(self, data: bytes) -> None:
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             try:
@@ -61,3 +93,16 @@ class Typed:
             assert isinstance(told, dict)
             for reply in told["replies"]:
                 self._say(reply)
+
+
+def _is_readable(fd: int) -> bool:
+    poll = select.poll()
+    poll.register(fd, select.POLLIN)
+    return bool(poll.poll(0))
+
+
+def _is_stop(line: str) -> bool:
+    try:
+        return EMERGENCY in commands_in((line,))
+    except CanductorError:  # no line of g-code
+        return False

@@ -12,6 +12,7 @@ from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Regist
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
+from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.support.values import Value
 from tests.stages import jump_loop
 
@@ -71,8 +72,11 @@ def registry_of(served: Served) -> Registry:
     def raw(_: Caller, params: dict[str, Any]) -> Value:
         return {"said": params["command"]}
 
+    def who_stops(caller: Caller, params: dict[str, Any]) -> str:
+        return str(params["who"] or caller.name)
+
     def stop(caller: Caller, params: dict[str, Any]) -> Value:
-        served.stops.append(params["who"] or caller.name)
+        served.stops.append(who_stops(caller, params))
         served.order.append("stop")
         return {"state": "shutdown"}
 
@@ -96,7 +100,7 @@ def registry_of(served: Served) -> Registry:
         Method("machine.info", Scope.WATCH, "Tell.", info),
         Method("move.to", Scope.OPERATE, "Move.", move, (x,)),
         Method("node.command", Scope.ADMIN, "Command.", raw, (Param("command", Kind.STR),)),
-        Method("machine.emergency_stop", Scope.OPERATE, "Stop.", stop, whom, urgent=True),
+        Method("machine.emergency_stop", Scope.OPERATE, "Stop.", stop, whom, urgent=True, stops=who_stops),
         Method("wait", Scope.WATCH, "Wait for ever.", wait),
         Method("broken", Scope.WATCH, "Fail.", broken),
         Method("unsendable", Scope.WATCH, "Return too much.", unsendable),
@@ -106,12 +110,18 @@ def registry_of(served: Served) -> Registry:
 
 
 @contextlib.asynccontextmanager
-async def serving(folder: Path, **settings: Any) -> AsyncIterator[Served]:
+async def serving(
+    folder: Path, *, stop_lane: StopLane | None = None, **settings: Any
+) -> AsyncIterator[Served]:
     """Serve at FOLDER/m.sock with SETTINGS."""
     path = folder / "m.sock"
     served = Served(None, StateTree(), path, IpcSettings(unix_path=path, **settings))  # type: ignore[arg-type]
     served.server = IpcServer(
-        registry_of(served), served.state, served.settings, on_notice=served.notices.put_nowait
+        registry_of(served),
+        served.state,
+        served.settings,
+        on_notice=served.notices.put_nowait,
+        stop_lane=stop_lane,
     )
     await served.server.start()
     try:

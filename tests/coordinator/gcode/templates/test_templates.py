@@ -67,7 +67,7 @@ def test_what_cannot_be_read_is_told_with_its_line(text: str, line: int, part: s
         ("\n\n{ 'a'|int + [] }", 3, "list"),
         ("{ ''.__class__.__mro__ }", 1, "unsafe"),
         ("{ x.__class__.__base__.__subclasses__() }", 1, "unsafe"),
-        ("{ f.__globals__.os }", 1, "unsafe"),
+        ("{ action_respond_info.__globals__.os }", 1, "unsafe"),
         ("{ (''|attr('__class__'))() }", 1, "unsafe"),
         ("{ '{0.__class__.__mro__}'.format(x) }", 1, "unsafe"),
         ("{% include '/etc/passwd' %}", 1, "no loader"),
@@ -76,7 +76,7 @@ def test_what_cannot_be_read_is_told_with_its_line(text: str, line: int, part: s
 )
 def test_what_goes_wrong_is_told_with_its_line(text: str, line: int, part: str) -> None:
     with pytest.raises(TemplateError) as error:
-        render(text, x="word", f=test_values_statements_and_comments)
+        render(text, x="word")
     assert error.value.line == line
     assert part in str(error.value)
 
@@ -121,10 +121,14 @@ def test_whatever_would_not_end_ends_with_a_sentence(text: str) -> None:
         render(text)
 
 
-def test_a_template_can_end_itself() -> None:
-    def fail(text: str) -> str:
-        raise Asked(text)
-
-    with pytest.raises(Asked, match="no filament"):
-        render("{% if 1 %}{ fail('no filament') }{% endif %}", fail=fail)
+def test_a_template_can_end_itself_and_what_it_asked_for_before_is_known() -> None:
+    with pytest.raises(Asked, match="no filament") as asked:
+        render("{action_respond_info(1)}{% if 1 %}{action_raise_error('no filament')}{% endif %}")
+    assert (asked.value.actions, asked.value.emergency) == ((("respond", "1"),), False)
+    with pytest.raises(Asked, match="hot") as asked:
+        render("{action_emergency_stop('hot')}")
+    assert asked.value.emergency
+    with pytest.raises(TemplateError) as error:
+        render("{action_call_remote_method('light', on=[1, (2,)], name='x')}{ 1 / 0 }")
+    assert error.value.actions == (("call", "light", {"on": [1, [2]], "name": "x"}),)
     assert render("{ 1 }") == "1"

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 from coordinator.assembly.check import check_config
-from coordinator.gcode.parser import WordError
+from coordinator.gcode.commands import Call
+from coordinator.gcode.parser import WordError, parse
 from coordinator.heat.mpc import Mpc
 from coordinator.verification.heat_proof import HeatWatch
 from nodes.support.errors import CanductorError
-from tests.stages.heat_machine import BED, FAN, HOTEND_PID, HeatMachine
+from tests.stages.heat_machine import BED, FAN, HOTEND_PID, HeatMachine, build
 
 MPC = (
     "control: mpc\nheater_power: 40\ncooling_fan: fan\nblock_heat_capacity: 13\nambient_transfer: 0.075\n"
@@ -101,6 +102,16 @@ def test_mpc_calibration_finds_the_plant(tmp_path: Path) -> None:
         assert 219 < low <= high < 221
 
     stage.connected(main)
+
+
+@pytest.mark.parametrize("bounds", ["MINIMUM=301", "MAXIMUM=-1", "MINIMUM=1e9 MAXIMUM=2e9"])
+def test_a_wait_that_cannot_come_true_is_refused(tmp_path: Path, bounds: str) -> None:
+    """Also when the program is only planned: no machine has to be there."""
+    command = parse(f"TEMPERATURE_WAIT SENSOR=extruder {bounds}".encode())
+    assert command is not None
+    read = build(tmp_path, HOTEND_PID).vocabulary.commands["TEMPERATURE_WAIT"].read
+    with pytest.raises(WordError, match=r"waits for what \[extruder\] never reads: it takes 0 to \d+ °C"):
+        read(Call(command, 1, (0, 0, 0, 0), ""))
 
 
 def test_a_wait_can_be_cancelled_and_the_heater_goes_on(tmp_path: Path) -> None:

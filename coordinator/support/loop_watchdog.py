@@ -1,0 +1,209 @@
+"""Watches the control loop: who holds it is named in the log, and what cannot wait is done meanwhile.
+
+A callback that calculates, or waits for a disk, holds everything that lives on the loop. A timer of the
+kernel is set whenever the loop begins to work and disarmed when it rests, so that watching costs two short
+calls of the system for each round, and wakes nobody while the loop is quick. It expires into a thread.
+"""
+
+import asyncio
+import ctypes
+import os
+import selectors
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from types import FrameType
+from typing import Any, Final
+
+LOOK_S: Final = 0.02
+"""From so long on, a loop that is still at work is looked at."""
+AGAIN_S: Final = 0.01
+"""Between further looks."""
+HELD_S: Final = 0.05
+"""Nothing may hold the loop for so long; it is reported."""
+REPORT_EVERY_S: Final = 10.0
+"""Reports between are left out, and counted."""
+STUCK_S: Final = 2.0
+"""A loop that is held for so long may never write its log: the report goes to standard error."""
+FRAMES_MAX: Final = 8
+"""Of a report, the innermost ones."""
+_CLOCK_MONOTONIC: Final = 1
+_CLOSE_ON_EXEC: Final = os.O_CLOEXEC
+_SIGNALS_BYTES: Final = 65_536
+
+
+class _Times(ctypes.Structure):
+    """``struct itimerspec``."""
+
+    _fields_ = tuple(
+        (f"{what}_{unit}", ctypes.c_long) for what in ("interval", "value") for unit in ("s", "ns")
+    )
+
+
+class _Timer:
+    """A timer of the kernel that a thread can wait for; the calls take about a microsecond."""
+
+    def __init__(self, first_s: float, again_s: float) -> None:
+        self._libc: Any = ctypes.PyDLL(None, use_errno=True)
+        self._fd: int = self._libc.timerfd_create(_CLOCK_MONOTONIC, _CLOSE_ON_EXEC)
+        if self._fd < 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number))
+        self._armed = ctypes.byref(_Times(0, round(again_s * 1e9), 0, round(first_s * 1e9)))
+        self._at_rest = ctypes.byref(_Times(0, 0, 0, 0))
+
+    def arm(self) -> None:
+        """Begin, from now on."""
+        self._libc.timerfd_settime(self._fd, 0, self._armed, None)
+
+    def disarm(self) -> None:
+        """Expire no more."""
+        self._libc.timerfd_settime(self._fd, 0, self._at_rest, None)
+
+    def wait(self) -> None:
+        """Wait until it expires."""
+        os.read(self._fd, 8)
+
+    def close(self) -> None:
+        """Let go of it."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+
+class _WatchedSelector(selectors.DefaultSelector):
+    """Where a loop rests; between two ``select`` it works."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.timer = _Timer(LOOK_S, AGAIN_S)
+        self.busy_since_s = 0.0
+        """When the loop began to work; 0: it rests."""
+
+    def close(self) -> None:
+        super().close()
+        self.timer.close()
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        self.busy_since_s = 0.0
+        self.timer.disarm()
+        events = super().select(timeout)
+        self.busy_since_s = time.monotonic()
+        self.timer.arm()
+        return events
+
+
+class WatchedLoop(asyncio.SelectorEventLoop):
+    """asyncio's loop, which a LoopWatchdog can watch."""
+
+    _ssock: socket.socket
+
+    def __init__(self) -> None:
+        self.watched = _WatchedSelector()
+        super().__init__(self.watched)
+
+    def pending_signals(self) -> list[int]:
+        """Return the numbers of the signals that came and were not handled yet; from any thread."""
+        try:
+            found = self._ssock.recv(_SIGNALS_BYTES, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except (OSError, AttributeError):  # nothing came; or the loop has closed
+            return []
+        return [number for number in found if number]
+
+
+class LoopWatchdog:
+    """Watches LOOP from ``start`` to ``close``, both on it.
+
+    REPORT gets a sentence when something held the loop, on the loop; WHILE_HELD is called in the watchdog's
+    thread again and again while something does.
+    """
+
+    def __init__(
+        self, loop: WatchedLoop, report: Callable[[str], None], while_held: Callable[[], None]
+    ) -> None:
+        self._loop = loop
+        self._report = report
+        self._while_held = while_held
+        self._selector = loop.watched
+        self._loop_thread = threading.get_ident()
+        self._thread = threading.Thread(target=self._run, name="loop watchdog", daemon=True)
+        self._closing = False
+        self._reported_s = -REPORT_EVERY_S
+        self._left_out = 0
+        self._seen_s = 0.0
+        self._stuck_s = 0.0
+        self._cpu_clock = time.pthread_getcpuclockid(self._loop_thread)
+        self._first = (0.0, 0.0, 0.0)
+        """Of the hold at hand: since when, when it was looked at first, the loop's processor time then."""
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Watch no more."""
+        self._closing = True
+        self._selector.timer.arm()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            self._selector.timer.wait()
+            if self._closing:
+                return
+            since_s = self._selector.busy_since_s
+            if not since_s:
+                continue
+            try:
+                self._while_held()
+                self._look(since_s)
+            except Exception:  # noqa: BLE001 (it has to go on: it may be what stops the machine)
+                traceback.print_exc()
+
+    def _look(self, since_s: float) -> None:
+        """Report a hold that began at SINCE_S, once."""
+        now_s = time.monotonic()
+        if self._first[0] != since_s:
+            self._first = (since_s, now_s, time.clock_gettime(self._cpu_clock))
+        if now_s - since_s >= STUCK_S and self._stuck_s != since_s:
+            self._stuck_s = since_s
+            sys.stderr.write(f"canductor: the control loop is held for {STUCK_S:g} s by {self._where()}\n")
+        if now_s - since_s < HELD_S or self._seen_s == since_s:
+            return
+        self._seen_s = since_s
+        if now_s - self._reported_s < REPORT_EVERY_S:
+            self._left_out += 1
+            return
+        where = self._where()
+        self._reported_s, left_out, self._left_out = now_s, self._left_out, 0
+        _, first_s, cpu_s = self._first
+        calculated_ms = (time.clock_gettime(self._cpu_clock) - cpu_s) * 1e3
+        more = (
+            f"; it calculated for {calculated_ms:.0f} of {(now_s - first_s) * 1e3:.0f} ms that were looked at"
+        )
+        more += f"; {left_out} times more since the last report" if left_out else ""
+        try:
+            self._loop.call_soon_threadsafe(self._tell, since_s, where, more)
+        except RuntimeError:  # the loop has ended
+            return
+
+    def _where(self) -> str:
+        return stack_of(sys._current_frames().get(self._loop_thread))  # noqa: SLF001 (its documented use)
+
+    def _tell(self, since_s: float, where: str, more: str) -> None:
+        held_ms = (time.monotonic() - since_s) * 1e3
+        self._report(f"the control loop was held for {held_ms:.0f} ms by {where}{more}; please report it")
+
+
+def stack_of(frame: FrameType | None) -> str:
+    """Return the innermost functions that FRAME stands in, the last one first, without asyncio's own."""
+    calls = []
+    for call in reversed(traceback.extract_stack(frame)):
+        if call.name == "_run_once":
+            break  # the rest is who runs the loop
+        if "/asyncio/" not in call.filename:
+            calls.append(f"{call.name} ({'/'.join(call.filename.split('/')[-2:])}:{call.lineno})")
+    return " < ".join(calls[:FRAMES_MAX]) or "asyncio itself"

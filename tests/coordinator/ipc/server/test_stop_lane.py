@@ -1,0 +1,161 @@
+"""Emergency stops that wait unread while the loop is held: by the test, which gives it no turn."""
+
+import asyncio
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.ipc.protocol.messages import Encoder, Encoding
+from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.stop_lane import StopLane
+from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, run
+from tests.coordinator.web.paged import LOOPBACK, Paged, paging
+from tests.stages import jump_loop
+
+HELLO: dict[str, Any] = {"id": 1, "method": "api.hello", "params": {"version": 1, "client": "new"}}
+STOP: dict[str, Any] = {"id": 2, "method": "machine.emergency_stop", "params": {"who": "me"}}
+
+
+def line(message: object) -> bytes:
+    return json.dumps(message).encode() + b"\n"
+
+
+class Lane(StopLane):
+    """Notes who stops the machine."""
+
+    def __init__(self) -> None:
+        self.stops: list[str] = []
+        super().__init__(self.stops.append)
+
+    def seen(self) -> list[str]:
+        """Look once, as the watchdog's thread does; return who stopped the machine by then."""
+        self.look()
+        return self.stops
+
+
+def test_a_client_stops_the_machine_and_gets_its_answer_later(tmp_path: Path) -> None:
+    lane = Lane()
+
+    async def go(served: Served) -> None:
+        script = await served.script(client="old")
+        assert lane.seen() == []
+        script.send("machine.info", 5)
+        script.send("machine.emergency_stop", 6)
+        assert len(lane.seen()) == 1
+        assert lane.stops[0].startswith("old (uid")
+        assert served.stops == [], "the loop has not read it"
+        assert {(await script.receive())["id"] for _ in range(2)} == {5, 6}
+        assert served.stops == lane.stops, "it carries out what it reads, in its turn"
+        script.send("machine.info", 7, what="machine.emergency_stop")
+        assert len(lane.seen()) == 1
+
+    run(tmp_path, go, stop_lane=lane)
+
+
+@pytest.mark.parametrize("cut", [1, 20, -1])
+def test_a_stop_whose_first_bytes_were_read_is_seen(tmp_path: Path, cut: int) -> None:
+    lane, sent = Lane(), line(STOP)
+
+    async def go(served: Served) -> None:
+        script = await served.script()
+        script.writer.write(sent[:cut])
+        await asyncio.sleep(0.1)
+        assert lane.seen() == []
+        script.writer.write(sent[cut:])
+        assert lane.seen() == ["me"]
+        await script.receive()
+
+    run(tmp_path, go, stop_lane=lane)
+
+
+@pytest.mark.parametrize("encoding", list(Encoding))
+def test_a_new_connection_stops_the_machine_with_its_first_bytes(tmp_path: Path, encoding: Encoding) -> None:
+    lane, encoder = Lane(), Encoder()
+
+    async def go(served: Served) -> None:
+        with socket.socket(socket.AF_UNIX) as opened:
+            opened.connect(served.at)
+            opened.sendall(encoder.message(encoding, HELLO))
+            assert lane.seen() == []
+            opened.sendall(encoder.message(encoding, STOP))
+            assert lane.seen() == ["me"]
+            opened.setblocking(False)
+            answer = b""
+            async with asyncio.timeout(30):
+                while b"shutdown" not in answer:
+                    answer += await asyncio.get_running_loop().sock_recv(opened, 10_000)
+        assert served.stops == ["me"]
+
+    run(tmp_path, go, stop_lane=lane)
+
+
+def test_who_may_not_stop_the_machine_does_not(tmp_path: Path) -> None:
+    lane = Lane()
+
+    async def go(served: Served) -> None:
+        guest = await served.script(scope="watch")
+        guest.send("machine.emergency_stop")
+        new = [socket.socket(socket.AF_UNIX) for _ in range(4)]
+        for opened, sent in zip(
+            new, (line(STOP), b"\x00garbage", b"", line(HELLO) + line([STOP])), strict=True
+        ):
+            opened.connect(served.at)
+            opened.sendall(sent)
+        assert lane.seen() == []
+        assert (await guest.receive())["error"]["code"] == "not_allowed"
+        for opened in new:
+            opened.close()
+
+    run(tmp_path, go, stop_lane=lane)
+
+
+def test_over_tcp_the_rights_of_the_token_count(tmp_path: Path) -> None:
+    lane = Lane()
+
+    async def go(served: Served) -> None:
+        for scope, stops in ((Scope.WATCH, []), (Scope.OPERATE, ["me"])):
+            reader, writer = await served.dial(tcp=True)
+            hello = {**HELLO, "params": {"version": 1, "token": TOKENS[scope]}}
+            writer.write(line(hello))
+            await reader.readline()
+            writer.write(line(STOP))
+            assert lane.seen() == stops
+
+    run(tmp_path, go, stop_lane=lane, tcp=plain_tcp(tmp_path))
+
+
+def test_the_page_stops_the_machine(tmp_path: Path) -> None:
+    lane = Lane()
+
+    async def go(paged: Paged) -> None:
+        for scope, stops in ((Scope.WATCH, []), (Scope.OPERATE, ["me"])):
+            async with paged.other() as other:
+                await other.sign_in(scope)
+                async with other.socket() as page:
+                    await other.hello(page)
+                    await page.ping()
+                    await page.send_str(json.dumps(STOP))
+                    assert lane.seen() == stops
+
+    async def main() -> None:
+        async with paging(tmp_path, LOOPBACK, stop_lane=lane) as paged:
+            await go(paged)
+
+    jump_loop.run(main())
+
+
+def test_a_client_that_has_left_is_forgotten(tmp_path: Path) -> None:
+    lane = Lane()
+
+    async def go(served: Served) -> None:
+        script = await served.script()
+        script.writer.close()
+        await asyncio.sleep(0.1)
+        assert not lane._unread
+        lane.close()
+        assert lane.seen() == []
+
+    run(tmp_path, go, stop_lane=lane)

@@ -1,0 +1,84 @@
+"""The watchdog of the control loop: what it does while the loop is held, and what it reports of that."""
+
+import asyncio
+import signal
+import threading
+import time
+from collections.abc import Callable
+
+from coordinator.support.loop_watchdog import HELD_S, LoopWatchdog, WatchedLoop
+
+PATIENCE_S = 60.0
+
+
+class Watched:
+    """A loop that is held until the watchdog has looked at it twice since it had to report that."""
+
+    def __init__(self) -> None:
+        self.reports: list[str] = []
+        self.threads: set[int] = set()
+        self.looks: Callable[[], None] = lambda: None
+        self._since_s = 0.0
+        self._late_looks = 0
+        self._over = threading.Event()
+
+    def hold_the_loop(self) -> None:
+        self._since_s, self._late_looks = time.monotonic(), 0
+        self._over.clear()
+        assert self._over.wait(PATIENCE_S)
+
+    def while_held(self) -> None:
+        self.threads.add(threading.get_ident())
+        self.looks()
+        self._late_looks += time.monotonic() - self._since_s > HELD_S
+        if self._late_looks > 2:
+            self._over.set()
+
+    async def main(self, *actions: Callable[[], None]) -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, WatchedLoop)
+        watchdog = LoopWatchdog(loop, self.reports.append, self.while_held)
+        watchdog.start()
+        try:
+            for act in actions:
+                loop.call_soon(act)
+                await asyncio.sleep(0)
+                await asyncio.sleep(0)
+                await asyncio.sleep(0)
+        finally:
+            watchdog.close()
+
+    def run(self, *actions: Callable[[], None]) -> None:
+        with asyncio.Runner(loop_factory=WatchedLoop) as runner:
+            runner.run(self.main(*actions))
+
+
+def test_who_holds_the_loop_is_named_and_others_are_counted() -> None:
+    watched = Watched()
+    watched.run(watched.hold_the_loop, watched.hold_the_loop)
+    (report,) = watched.reports
+    assert report.startswith("the control loop was held for ")
+    assert "hold_the_loop (support/test_loop_watchdog.py:" in report
+    assert "asyncio/" not in report
+    assert "main (" not in report, "nor who runs the loop"
+    assert "it calculated for " in report
+    assert threading.get_ident() not in watched.threads
+
+
+def test_signals_that_wait_are_seen_while_the_loop_is_held() -> None:
+    watched, came, seen = Watched(), list[int](), list[int]()
+
+    def hold() -> None:
+        signal.raise_signal(signal.SIGUSR1)
+        watched.hold_the_loop()
+
+    def begin() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, WatchedLoop)
+        loop.add_signal_handler(signal.SIGUSR1, lambda: came.append(len(seen)))
+        watched.looks = lambda: seen.extend(loop.pending_signals())
+
+    watched.run(begin, hold)
+    assert set(seen) == {signal.SIGUSR1}
+    assert came, "the loop has it, too"
+    assert came[0] > 0, "and later"

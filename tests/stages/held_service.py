@@ -1,0 +1,146 @@
+"""A whole service on virtual nodes in real time, in the main thread, whose control loop can be held."""
+
+import asyncio
+import contextlib
+import os
+import pty
+import sys
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+
+from coordinator.assembly.load import load_machine
+from coordinator.front_ends.stop_path import StopPath
+from coordinator.ipc.client.blocking import BlockingClient
+from coordinator.ipc.protocol.methods import Registry
+from coordinator.ipc.server.server import IpcServer
+from coordinator.ipc.server.settings import IpcSettings
+from coordinator.ipc.server.state import StateTree
+from coordinator.klippy_api.gateway import Gateway
+from coordinator.runtime.linux_host import LinuxHost
+from coordinator.service.api.methods import add_methods
+from coordinator.service.core.machine_service import MachineService, ServiceSettings, ServiceState
+from coordinator.service.core.typed import Typed
+from coordinator.support.interrupts import run_to_end
+from coordinator.support.loop_watchdog import WatchedLoop
+from nodes.virtual.plant_page import PlantItemKind, PlantPage
+from tests.stages.real_nodes import CONFIG, real_nodes
+
+MACHINE = Path("config/corexy_toolhead.cfg")
+NODE = "toolhead"
+PATIENCE_S = 60.0
+"""Only for what does not come at all."""
+
+
+class HeldService:
+    """SERVICE with its interfaces in FOLDER; what tests do is done in another thread than its loop's."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.socket, self.klippy_socket = folder / "api.sock", folder / "klippy.sock"
+        self.lines: list[str] = []
+        self.service: MachineService
+        self.loop: asyncio.AbstractEventLoop
+        self.terminal = -1
+        """Where a user types."""
+
+    @property
+    def fan_turns(self) -> bool:
+        """Whether the toolhead's fan is on, by its pin."""
+        return PlantPage.at(self.folder, NODE).item(PlantItemKind.FAN, "fan").value > 0
+
+    def ready(self) -> None:
+        """Wait until the machine is ready, and switch the fan on."""
+        self.wait_for(lambda: self.service.state is ServiceState.READY, "it is ready")
+        with BlockingClient(str(self.socket)) as client:
+            client.call("gcode.run", {"script": "M106 S255"})
+        self.wait_for(lambda: self.fan_turns, "the fan turns")
+
+    def wait_for(self, true: Callable[[], bool], what: str) -> None:
+        """Wait until TRUE."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not true():
+            assert time.monotonic() < deadline_s, f"no end of waiting until {what}: {self.lines[-5:]}"
+            time.sleep(0.005)
+
+    def restart(self) -> None:
+        """Start the machine that was stopped again."""
+        self.wait_for(lambda: self.service.state is ServiceState.SHUTDOWN, "it is shut down")
+        self.loop.call_soon_threadsafe(lambda: self.service.restart(firmware=True))
+        self.wait_for(lambda: self.service.state is ServiceState.STARTUP, "it starts")
+        self.ready()
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the loop inside."""
+        begun, over = threading.Event(), threading.Event()
+
+        def hold_the_loop() -> None:
+            begun.set()
+            assert over.wait(PATIENCE_S)
+
+        self.loop.call_soon_threadsafe(hold_the_loop)
+        assert begun.wait(PATIENCE_S)
+        try:
+            yield
+        finally:
+            over.set()
+
+    async def serve(self, test: Callable[[], None]) -> None:
+        """Serve until TEST, in a thread, has ended; raises what it raised."""
+        self.loop = asyncio.get_running_loop()
+        async with self._interfaces():
+            testing = asyncio.ensure_future(asyncio.to_thread(test))
+            serving = asyncio.ensure_future(self.service.run())
+            try:
+                await asyncio.wait((testing, serving), return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                serving.cancel()
+                await asyncio.gather(serving, return_exceptions=True)
+            await testing
+
+    @asynccontextmanager
+    async def _interfaces(self) -> AsyncIterator[None]:
+        registry, tree = Registry(), StateTree()
+        settings = ServiceSettings(name="held", jobs=self.folder)
+        self.service = MachineService(
+            lambda: load_machine(str(self.folder / CONFIG)),
+            LinuxHost(),
+            tree,
+            settings,
+            on_line=lambda entry: self.lines.append(str(entry["text"])),
+        )
+        add_methods(self.service, registry)
+        path = StopPath(self.service)
+        server = IpcServer(registry, tree, IpcSettings(unix_path=self.socket), stop_lane=path.lane)
+        gateway = Gateway(
+            self.service, self.folder / CONFIG, on_notice=self.lines.append, stop_lane=path.lane
+        )
+        typed = Typed(self.service, self.lines.append)
+        path.lane.look_also(typed.find_stop)
+        await server.start()
+        await gateway.start(self.klippy_socket)
+        path.start()
+        try:
+            yield
+        finally:
+            path.close()
+            typed.close()
+            await server.close()
+            await gateway.close()
+
+
+def serve_held(folder: Path, test: Callable[[HeldService], None]) -> None:
+    """Run TEST with a service in FOLDER."""
+    held = HeldService(folder)
+    stdin = sys.stdin
+    held.terminal, theirs = pty.openpty()
+    with real_nodes(MACHINE, folder), contextlib.ExitStack() as stack:
+        stack.callback(os.close, held.terminal)
+        sys.stdin = stack.enter_context(os.fdopen(theirs))
+        try:
+            run_to_end(lambda: held.serve(lambda: test(held)), WatchedLoop)
+        finally:
+            sys.stdin = stdin
