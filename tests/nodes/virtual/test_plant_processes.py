@@ -156,6 +156,7 @@ def test_a_motors_node_that_stands_still_is_waited_for_and_then_given_up(start: 
     # A step each half second: wherever it is stopped, it has one to make before long.
     still.send(f"reset_step_clock oid=0 clock={still.clock() % ROLLOVER}")
     still.send(f"queue_step oid=0 interval={still.freq_hz // 2} count=1000 add=0")
+    still.clock()  # an answer: it has read the steps
     still.process.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, still.process.pid, os.WSTOPPED)
     begin = node.clock() + node.freq_hz // 10
