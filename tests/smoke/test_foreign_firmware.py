@@ -55,6 +55,7 @@ def edit(config: Path, pin: str) -> None:
         file.write(section(f"output_pin {name}", pin=pin))
 
 
+@thorough
 def test_a_linux_process(tmp_path: Path) -> None:
     """FIRMWARE_RESTARTs in a row, a shutdown, a killed process, an edit; then it homes and moves exactly."""
     with LinuxProcess(tmp_path) as firmware:

@@ -16,7 +16,7 @@ MAX_POWER: Final = FloatOption(
 )
 CYCLE_TIME: Final = FloatOption(
     name="pwm_cycle_time",
-    help="time in which the heater is switched on and off once",
+    help="period of its PWM",
     default=0.1,
     unit="s",
     minimum=0.001,
@@ -39,7 +39,7 @@ CONTROL: Final = ChoiceOption(
 )
 MAX_DELTA: Final = FloatOption(
     name="max_delta",
-    help="watermark: switched off so far above the target, and on so far below",
+    help="watermark control: hysteresis above and below the target",
     default=2.0,
     unit="K",
     above=0,

@@ -22,7 +22,7 @@ MAX_POWER: Final = FloatOption(
 )
 CYCLE_TIME: Final = FloatOption(
     name="cycle_time",
-    help="time in which the fan is switched on and off once",
+    help="period of its PWM",
     default=0.01,
     unit="s",
     minimum=1e-6,

@@ -46,7 +46,7 @@ RETRY_TOLERANCE: Final = FloatOption(
 )
 INCREASING: Final = FloatOption(
     name="increasing_threshold",
-    help="by how much the heights may be further apart than in the pass before",
+    help="how much the spread of heights may grow from one pass to the next",
     default=1e-7,
     unit="mm",
     minimum=0,

@@ -35,7 +35,7 @@ SCALE: Final = FloatOption(
 )
 CYCLE_TIME: Final = FloatOption(
     name="cycle_time",
-    help="PWM: time in which it is switched on and off once",
+    help="PWM: period",
     default=0.1,
     unit="s",
     minimum=1e-6,

@@ -87,7 +87,7 @@ ACTIVATE: Final = GCodeOption(name="activate_gcode", help="what is done before t
 DEACTIVATE: Final = GCodeOption(name="deactivate_gcode", help="what is done after it", default="")
 EACH: Final = BoolOption(
     name="deactivate_on_each_sample",
-    help="whether these are done for each sample; else once for all places of a command",
+    help="whether to run these for each sample, not once per command",
     default=True,
 )
 PARAMETERS: Final = (

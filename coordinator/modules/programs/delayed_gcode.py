@@ -11,7 +11,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.support.values import Value
 
-GCODE = GCodeOption(name="gcode", help="What is run: g-code, with Jinja2 between { and {% %}")
+GCODE = GCodeOption(name="gcode", help="g-code to run, a Jinja2 template with { } and {% %}")
 INITIAL = FloatOption(
     name="initial_duration",
     help="Delay after the start; 0: only UPDATE_DELAYED_GCODE starts it",

@@ -16,7 +16,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.printer_status import PrinterStatus
 from coordinator.support.values import Value
 
-GCODE = GCodeOption(name="gcode", help="What is run: g-code, with Jinja2 between { } and {% %}")
+GCODE = GCodeOption(name="gcode", help="g-code to run, a Jinja2 template with { } and {% %}")
 RENAME = TextOption(
     name="rename_existing",
     help="Name for the command that had this macro's name before, such as M109.1 or BASE_PAUSE",

@@ -24,7 +24,7 @@ TIMEOUT = FloatOption(
 )
 GCODE = GCodeOption(
     name="gcode",
-    help="What is run then; by default TURN_OFF_HEATERS and M84, where there are heaters and motors",
+    help="g-code to run then; by default TURN_OFF_HEATERS and M84, where there are heaters and motors",
     default="",
 )
 OFF: Final = ("TURN_OFF_HEATERS", "M84")
@@ -35,7 +35,7 @@ class IdleTimeout(Module):
     """Watches for idleness and acts."""
 
     KIND = "idle_timeout"
-    SPEC = SectionSpec("What is run when the machine is idle", (TIMEOUT, GCODE))
+    SPEC = SectionSpec("G-code to run when the machine is idle", (TIMEOUT, GCODE))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

@@ -28,7 +28,7 @@ PATH = TextOption(
     " home",
 )
 ON_ERROR = GCodeOption(
-    name="on_error_gcode", help="What is run when a line of a job cannot be carried out", default=""
+    name="on_error_gcode", help="g-code to run when a line of a job cannot be carried out", default=""
 )
 _BUSY: Final = "a job is active; wait for its end, or cancel it"
 

@@ -24,10 +24,10 @@ PAUSE: Final = BoolOption(
     default=True,
 )
 RUNOUT: Final = GCodeOption(
-    name="runout_gcode", help="What is run when a job runs out of filament", default=""
+    name="runout_gcode", help="g-code to run when a job runs out of filament", default=""
 )
 INSERT: Final = GCodeOption(
-    name="insert_gcode", help="What is run when filament is inserted while no job prints", default=""
+    name="insert_gcode", help="g-code to run when filament is inserted while no job prints", default=""
 )
 EVENT_DELAY: Final = FloatOption(
     name="event_delay",

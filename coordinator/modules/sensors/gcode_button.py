@@ -13,8 +13,8 @@ from coordinator.support.values import Value
 from nodes.devices.button import Button
 
 PIN: Final = PinOption(name="pin", help="input of the button; pressed is high, with ! low", pullable=True)
-PRESS: Final = GCodeOption(name="press_gcode", help="What is run when it is pressed")
-RELEASE: Final = GCodeOption(name="release_gcode", help="What is run when it is released", default="")
+PRESS: Final = GCodeOption(name="press_gcode", help="g-code to run when it is pressed")
+RELEASE: Final = GCodeOption(name="release_gcode", help="g-code to run when it is released", default="")
 LATER: Final = ("analog_range", "analog_pullup_resistor", "debounce_delay")
 _COMMAND: Final = "_BUTTON"
 

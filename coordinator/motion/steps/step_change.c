@@ -293,10 +293,9 @@ int step_set_surface(struct step_gen *gen, const struct step_surface *grid, doub
     if (!may_change(gen))
         return STEP_NOT_IDLE;
     start_afresh(gen);
-    double at[AXES], still[AXES] = {0};
+    double at[AXES];
     memcpy(at, gen->rest, sizeof(at));
-    if (gen->surface.grid.points_x)
-        step_surface_add(&gen->surface, at, still);
+    at[AXIS_Z] = step_surface_motor_z(&gen->surface.grid, at[AXIS_X], at[AXIS_Y], at[AXIS_Z]);
     step_surface_set(&gen->surface, grid);
     gen->rest[AXIS_Z] = step_surface_planned_z(&gen->surface.grid, at[AXIS_X], at[AXIS_Y], at[AXIS_Z]);
     start_afresh(gen);
