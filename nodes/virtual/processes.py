@@ -97,10 +97,14 @@ class ChildProcess:
         Raises CanductorError when it had ended before, does not end in time (it is killed), or ends with an
         error.
         """
+        if self._statistics is None and self.running:
+            self._process.terminate()
+        return self.wait_end(timeout_s)
+
+    def wait_end(self, timeout_s: float = STOP_TIMEOUT_S) -> dict[str, Any]:
+        """Wait until the process ends by itself, and return its counters; errors as for stop()."""
         if self._statistics is not None:
             return self._statistics
-        if self.running:
-            self._process.terminate()
         deadline_s = time.monotonic() + timeout_s
         line = self._read_line(timeout_s)
         if line is not None and line.get("ready") is True:  # it was stopped before wait_ready()
