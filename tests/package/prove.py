@@ -2,9 +2,10 @@
 
 Usage: python -m tests.package.prove [--keep FOLDER] [PYTHON...]
 
-For each PYTHON (default: this one, and one of every other version found on the PATH or below pyenv; what
-cannot build is named and skipped) a new virtual environment in a temporary folder gets the wheel that pip
-builds from the source distribution, with its dependencies from pip's index. There the demo prints a small
+PYTHONs are this one and one of every other version found on the PATH or below pyenv, unless some are named;
+what could not build it is named and skipped. The first one's pip builds the wheel from the source
+distribution, for all of them, since it is one of the stable ABI. For each, a new virtual environment in a
+temporary folder gets that wheel, with its dependencies from pip's index. There the demo prints a small
 program and has to end with its proof. Exit status 1 when anything fails; the last words say what.
 """
 
@@ -39,6 +40,7 @@ G1 Z0.6 F600
 """
 """Every stepper of the demo machine moves; two seconds."""
 DEMO: Final = ("--machine", "demo", "--json", "--gcode", "square.gcode")
+PIP: Final = ("pip", "-q", "--disable-pip-version-check")
 PAGES: Final = "import coordinator.web.files as f; assert (f.FOLDER / 'index.html').is_file()"
 VERSION: Final = "import sys; print('%d.%d' % sys.version_info[:2])"
 LOCATION: Final = "import coordinator; print(coordinator.__file__)"
@@ -97,31 +99,39 @@ def missing(python: str) -> str:
     return subprocess.run(words, capture_output=True, text=True, check=False).stderr.strip()
 
 
-def prove(archive: Path, python: str, folder: Path) -> str:
-    """Return in a sentence what was proved of the source distribution ARCHIVE, with PYTHON, in FOLDER."""
+def environment(python: str, folder: Path) -> Path:
+    """Return the folder of the commands of a new virtual environment for PYTHON, in FOLDER."""
     folder.mkdir()
-    environment = folder / "venv"
-    run(folder, python, "-m", "venv", environment)
-    pip = (environment / "bin" / "python", "-m", "pip", "-q", "--disable-pip-version-check")
+    run(folder, python, "-m", "venv", folder / "venv")
+    return folder / "venv" / "bin"
+
+
+def build(archive: Path, python: str, folder: Path) -> tuple[Path, float]:
+    """Return the wheel of the source distribution ARCHIVE, built in FOLDER, and the seconds it took."""
+    commands = environment(python, folder)
     begun_s = time.monotonic()
-    run(folder, *pip, "wheel", "--no-deps", "--wheel-dir", folder, archive)
-    built_s = time.monotonic() - begun_s
+    run(folder, commands / "python", "-m", *PIP, "wheel", "--no-deps", "--wheel-dir", folder, archive)
     (wheel,) = folder.glob("*.whl")
-    run(folder, *pip, "install", wheel)
+    return wheel, time.monotonic() - begun_s
+
+
+def prove(wheel: Path, python: str, folder: Path) -> str:
+    """Return in a sentence what was proved of WHEEL, installed for PYTHON in FOLDER."""
+    commands = environment(python, folder)
+    run(folder, commands / "python", "-m", *PIP, "install", wheel)
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
-    installed = environment / "bin"
-    where = Path(run(elsewhere, installed / "python", "-c", LOCATION).strip())
-    if not where.is_relative_to(environment):
+    where = Path(run(elsewhere, commands / "python", "-c", LOCATION).strip())
+    if not where.is_relative_to(folder):
         raise ProofError(f"the installation imports {where}")
-    run(elsewhere, installed / "python", "-W", "error", "-c", PAGES)
-    run(elsewhere, installed / "canductor", "simulate", "--list")
+    run(elsewhere, commands / "python", "-W", "error", "-c", PAGES)
+    run(elsewhere, commands / "canductor", "simulate", "--list")
     (elsewhere / "square.gcode").write_text(PROGRAM)
-    shown = run(elsewhere, installed / "canductor", "demo", *DEMO, seconds=120)
+    shown = run(elsewhere, commands / "canductor", "demo", *DEMO, seconds=120)
     report = json.loads(shown.splitlines()[-1])
     if report.get("ok") is not True or not report.get("steps"):
         raise ProofError(f"the demo is not proved: {shown}")
-    return f"{wheel.name} built in {built_s:.0f} s, demo PROVED, {report['steps']} steps"
+    return f"demo PROVED, {report['steps']} steps"
 
 
 def main() -> int:
@@ -135,10 +145,16 @@ def main() -> int:
         try:
             setup(folder, "sdist", "--formats=gztar", f"--dist-dir={folder}")
             (archive,) = folder.glob("*.tar.gz")
+            wheel = None
             for version, python in interpreters(options.pythons):
                 lacking = python != sys.executable and not options.pythons and missing(python)
-                shown = f"skipped: {lacking}" if lacking else prove(archive, python, folder / version)
-                print(f"python {version}: {shown}", flush=True)
+                if lacking:
+                    print(f"python {version}: skipped: {lacking}", flush=True)
+                    continue
+                if wheel is None:
+                    wheel, built_s = build(archive, python, folder / "build")
+                    print(f"python {version}: {wheel.name} built in {built_s:.0f} s", flush=True)
+                print(f"python {version}: {prove(wheel, python, folder / version)}", flush=True)
         except (ProofError, subprocess.SubprocessError) as error:
             print(f"package: {error}", file=sys.stderr)
             return 1
