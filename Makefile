@@ -47,7 +47,7 @@ ctest: setup
 
 # A file's tests run in one process, in order: what they share is set up once.
 pytest: setup
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 # All of it side by side. Nothing but a dozen smoke tests takes real time (docs/testing.md).
 test: setup
