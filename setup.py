@@ -3,6 +3,7 @@
 A cffi module is found by its build script: any ``build_*.py`` in a package that defines ``ffibuilder``.
 """
 
+import os
 import shutil
 import subprocess
 import sys
@@ -54,14 +55,20 @@ class BuildPython(build_py):
 
 
 class BuildNative(build_ext):
-    """Compiles the firmware of virtual nodes with the extension modules."""
+    """Compiles the firmware of virtual nodes with the extension modules, on all cores."""
+
+    def finalize_options(self) -> None:
+        super().finalize_options()
+        self.parallel = self.parallel or True  # as many as there are cores
 
     def run(self) -> None:
         super().run()
         inplace = self.inplace or self.editable_mode
         bin_dir = (ROOT if inplace else Path(self.build_lib).absolute()) / "nodes" / "virtual" / "bin"
         options = [f"BIN_DIR={bin_dir}", f"PYTHON={sys.executable}"]
-        subprocess.run(["make", "-C", str(ROOT / "firmware"), "linux", *options], check=True)
+        subprocess.run(
+            ["make", f"-j{os.cpu_count()}", "-C", str(ROOT / "firmware"), "linux", *options], check=True
+        )
 
 
 setup(
