@@ -17,7 +17,7 @@ MACHINES = ("cartesian_plain", "corexy_is_pa", "corexy_is_pa_toolhead")
 PROGRAMS = ("text_cube", "vase")
 WINDOWS = 24
 WINDOW_S = 0.25
-CI_LINES = 4000
+CI_LINES = 2000
 """What ``ci`` plans of a program: its first layers."""
 
 
