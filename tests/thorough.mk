@@ -6,7 +6,7 @@ AREA ?=
 MINUTES ?= 15
 STEPS ?=
 
-.PHONY: thorough sim mutants mutation soak
+.PHONY: thorough sim mutants mutation soak arm
 
 thorough: setup
 	$(BIN)/python -m tests.thorough.run --seeds $(SIM_SEEDS) --seed $(SEED) --sample $(SAMPLE) \
@@ -27,3 +27,7 @@ mutation: setup
 # A service prints on virtual nodes while clients come and go: memory, descriptors, threads must not grow.
 soak: setup
 	$(BIN)/python -m tests.soak.run --minutes $(MINUTES)
+
+# The processors of small computers, emulated: C tests, and streams and simulated runs that must be those of this one.
+arm: setup
+	$(BIN)/python -m tests.arm.prove $(PROCESSORS)

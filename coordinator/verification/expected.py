@@ -74,7 +74,7 @@ def _phases(moves: NDArray[np.void], weights: Floats, step_distance: float, orig
 
 def _crossings(phases: _Phases, before: Ints, after: Ints) -> ExpectedSteps:
     """Return the times at which each phase crosses the half-step boundaries between BEFORE and AFTER."""
-    count = np.abs(after - before)
+    count = np.abs(after - before).astype(np.intp)  # on 32 bits, repeat() takes no longer numbers
     which = np.repeat(np.arange(len(count)), count)
     nth = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
     direction = np.sign(after - before)[which]

@@ -30,7 +30,7 @@ def expected_curved(legs: Sequence[Leg], clock_freq: float) -> Iterator[Expected
 def _steps(path: StepperPath, turns: Floats, u: Floats, place: Floats) -> tuple[Floats, Ints]:
     """Return times and directions of the steps of PATH, given its places."""
     change = np.diff(place).astype(np.int64)
-    count = np.abs(change)
+    count = np.abs(change).astype(np.intp)  # on 32 bits, repeat() takes no longer numbers
     which = np.repeat(np.arange(len(count)), count)
     nth = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
     direction = np.sign(change)[which]

@@ -106,7 +106,8 @@ static uint64_t queued(const struct io_thread *thread) {
         return ioctl(thread->fd, TIOCOUTQ, &bytes) == 0 ? (uint64_t)bytes : IO_QUEUED_UNKNOWN;
     uint32_t memory[SK_MEMINFO_VARS];
     socklen_t size = sizeof memory;
-    if (getsockopt(thread->fd, SOL_SOCKET, SO_MEMINFO, memory, &size) != 0)
+    if (getsockopt(thread->fd, SOL_SOCKET, SO_MEMINFO, memory, &size) != 0 ||
+        size <= SK_MEMINFO_WMEM_ALLOC * sizeof memory[0]) // an emulated kernel may give less
         return IO_QUEUED_UNKNOWN;
     uint64_t frames = 0;
     unsigned buffers = memory[SK_MEMINFO_WMEM_ALLOC] / SKB_BYTES;

@@ -14,16 +14,24 @@ static size_t header_of(const struct link_queue *queue) {
     return queue->stamped ? BATCH_HEADER + STAMP : BATCH_HEADER;
 }
 
+// Where what was put AT this count of bytes begins in memory.
+static size_t start_of(const struct link_queue *queue, uint64_t at) {
+    return (size_t)(at & (queue->size - 1));
+}
+
+static size_t up_to_the_end(const struct link_queue *queue, size_t start, size_t size) {
+    size_t room = (size_t)queue->size - start;
+    return size < room ? size : room;
+}
+
 static void copy_in(struct link_queue *queue, uint64_t at, const uint8_t *from, size_t size) {
-    size_t start = at & (queue->size - 1);
-    size_t first = size < queue->size - start ? size : queue->size - start;
+    size_t start = start_of(queue, at), first = up_to_the_end(queue, start, size);
     memcpy(queue->memory + start, from, first);
     memcpy(queue->memory, from + first, size - first);
 }
 
 static void copy_out(const struct link_queue *queue, uint64_t at, uint8_t *to, size_t size) {
-    size_t start = at & (queue->size - 1);
-    size_t first = size < queue->size - start ? size : queue->size - start;
+    size_t start = start_of(queue, at), first = up_to_the_end(queue, start, size);
     memcpy(to, queue->memory + start, first);
     memcpy(to + first, queue->memory, size - first);
 }
@@ -54,7 +62,7 @@ int link_queue_put_stamped(struct link_queue *queue, const struct link_command *
 
 uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct link_command *out) {
     uint8_t header[BATCH_HEADER + STAMP]; // a fixed size, for speed: executed for every command
-    size_t start = at & (queue->size - 1);
+    size_t start = start_of(queue, at);
     if (queue->size - start >= sizeof header)
         memcpy(header, queue->memory + start, sizeof header);
     else

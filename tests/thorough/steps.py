@@ -62,6 +62,12 @@ def steps(amount: Amount) -> Iterator[Step]:
         (python, "-m", "tests.mutation.run", "--seed", str(amount.seed), "--sample", str(amount.sample)),
         r"^[\d.]+% survive unexplained.*$",
     )
+    yield Step(
+        "arm",
+        "64 and 32 bits of ARM, emulated, beside this processor",
+        (python, "-m", "tests.arm.prove"),
+        r"^arm(?=:.*command streams).*$",
+    )
     yield Step("fuzz", "the motion engine under the sanitizers", (*fuzz, "run"), _FUZZ_FIGURE)
     yield Step("fuzz-mt", "the table receiver under the sanitizers", (*fuzz, "mt"), _FUZZ_FIGURE)
     yield Step("fuzz-live", "the sockets of a machine that prints", (*fuzz, "live"), r"^lead lost.*$")

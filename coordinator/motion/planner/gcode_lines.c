@@ -8,8 +8,6 @@ static const double MIN_ACCEL = 1e-3; // mm/s²
 // ---- Numbers
 // -----------------------------------------------------------------------------------------------
 
-__extension__ typedef unsigned __int128 wide;
-
 enum { MAX_DIGITS = 19, EXACT_POWERS = 22 };
 static const double POWER_OF_TEN[EXACT_POWERS + 1] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,
                                                       1e8,  1e9,  1e10, 1e11, 1e12, 1e13, 1e14, 1e15,
@@ -24,17 +22,23 @@ static double scale_down(uint64_t mantissa, uint32_t decimals) {
     // Both operands are exact doubles, so IEEE division rounds the exact quotient.
     if (mantissa <= UINT64_C(1) << 53)
         return (double)mantissa / POWER_OF_TEN[decimals];
-    // At least 64 bits of quotient, the lowest of them set when a remainder is left: that rounds as the exact
-    // value would. 10^decimals < 2^64 as decimals <= 19.
+    // 10^decimals < 2^64 as decimals <= 19.
     uint64_t divisor = 1;
     for (uint32_t i = 0; i < decimals; i++)
         divisor *= 10;
     int up = __builtin_clzll(mantissa), down = __builtin_clzll(divisor);
-    wide numerator = (wide)(mantissa << up) << 64;
+    uint64_t rest = mantissa << up;
     divisor <<= down;
-    wide quotient = numerator / divisor;
-    quotient |= numerator % divisor != 0;
-    return ldexp((double)quotient, down - up - 64);
+    // The quotient has 63 bits or more, the lowest of them set when a remainder is left: that rounds as the
+    // exact value would. Bit by bit, since not every processor divides 128 bits; few numbers are so long.
+    uint64_t quotient = rest >= divisor;
+    rest -= quotient ? divisor : 0;
+    for (int i = 0; i < 63; i++) {
+        uint64_t bit = rest >> 63 || rest << 1 >= divisor;
+        rest = (rest << 1) - (bit ? divisor : 0);
+        quotient = quotient << 1 | bit;
+    }
+    return ldexp((double)(quotient | (rest != 0)), down - up - 63);
 }
 
 // Digits of up to 7 characters at once: the length of a number in a program is not predictable, so a loop

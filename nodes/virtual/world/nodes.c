@@ -177,7 +177,7 @@ static uint64_t true_ns(void *context, uint64_t clock) {
 }
 
 const struct world_edge *world_node_edges(const struct world_node *node, size_t *count) {
-    *count = node->counters.edges;
+    *count = (size_t)node->counters.edges;
     return node->edges;
 }
 

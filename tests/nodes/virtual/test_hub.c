@@ -311,7 +311,7 @@ static void any_bytes_do_no_harm(void) {
         for (size_t i = 0; i < sizeof(bytes); i++)
             bytes[i] = (uint8_t)((random >> (i % 50)) & (i % 16 == 1 || i % 16 == 4 ? 7 : 0xFF));
         bytes[2] = bytes[3] = bytes[18] = bytes[19] = 0; // or hardly any would be a frame
-        size_t room = hub_room(&hub, client), size = (random >> 40) % sizeof(bytes);
+        size_t room = hub_room(&hub, client), size = (size_t)(random >> 40) % sizeof(bytes);
         hub_receive(&hub, client, bytes, size < room ? size : room, now_ns);
         now_ns += (random >> 20) % 100000;
         hub_run(&hub, now_ns);
