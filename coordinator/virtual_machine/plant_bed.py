@@ -2,11 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 
+from coordinator.config.file import parse_config
 from coordinator.config.model import MachineDescription
+from coordinator.config.pins import PinOption
+from coordinator.config.sections.nodes import make_pin_registry
+from nodes.support.errors import CanductorError
 from nodes.virtual.plant import Axis, Bed, Probe, Term
+
+
+_CONTROL: Final = PinOption(name="control_pin", help="", share="plant")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,8 +72,25 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
         hysteresis=settings.hysteresis_mm,
         noise=settings.noise_mm,
         inverted=pin.invert,
+        control_pin=_control_pin(description, described.section, pin.node),
     )
     return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, probe)
+
+
+def _control_pin(description: MachineDescription, section: str, node: str) -> str | None:
+    """Return the pin that moves the pin of a BLTouch; None: SECTION is another kind of probe."""
+    if section != "bltouch":
+        return None
+    config = parse_config(description.path)
+    given, registry = config.sections[section], make_pin_registry(config, description.nodes)
+    name = _CONTROL.parse(given.options[_CONTROL.name].value)
+    pin = registry.claim(name, _CONTROL, given)
+    if pin.node != node:
+        raise CanductorError(
+            f"[{section}] has its sensor_pin on node {node} and its control_pin on {pin.node}; the plant of a"
+            " demo can only have both on one node"
+        )
+    return pin.name
 
 
 def frame_axes(description: MachineDescription, z: Axis, settings: BedSettings) -> tuple[Axis, Axis, Axis]:

@@ -80,6 +80,15 @@ struct plant_bed {
     double z, x0, y0, tilt_x, tilt_y, bow, radius;
 };
 
+// What moves the pin of a BLTouch: a servo's signal, whose pulses are commands by their lengths. Two equal
+// pulses are needed. Out: the pin is down.
+struct plant_bltouch {
+    uint64_t rise_ns;
+    int heard, command; // of the last pulse, what is being done; 0: none
+    int lowers, out, touch_mode, alarm;
+    uint64_t moved_ns, pulse_ns; // when the pin is where it is to be, until when its touch is shown
+};
+
 // Pressed (high, or low when inverted) from AT on in DIRECTION (1 or -1). It is released HYSTERESIS before
 // that again, and each approach finds it up to NOISE beside AT.
 // A probe is a switch that the bed presses: it is at OFFSET_X, OFFSET_Y from the nozzle, and pressed when the
@@ -92,6 +101,8 @@ struct plant_switch {
     int bed; // of a probe; -1: it is an endstop
     int x_axis, y_axis, slope_x_axis, slope_y_axis;
     double offset_x, offset_y, offset_z;
+    int control_pin; // of a probe with a pin that a servo's signal moves; -1: it has none
+    struct plant_bltouch bltouch;
     int pressed;
     double shift; // of this approach
     uint64_t switched;
@@ -258,6 +269,10 @@ double plant_axis_position(struct plant *plant, struct plant_axis *axis, uint64_
 int plant_switch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns);
 int64_t plant_term_count(struct plant *plant, struct plant_term *term, uint64_t ns);
 void plant_steps_lost(struct plant *plant, uint64_t ns, int stepper, uint64_t steps);
+double plant_probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns);
+// plant_bltouch.c
+void plant_bltouch_edge(struct plant *plant, struct plant_switch *it, uint64_t ns, int level);
+int plant_bltouch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns, uint32_t fault);
 // plant_tmc.c
 void plant_tmc_start(struct plant *plant, struct plant_tmc *tmc, uint64_t ns);
 void plant_tmc_look(struct plant *plant, struct plant_tmc *tmc, uint64_t ns); // takes what has come since

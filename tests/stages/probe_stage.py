@@ -28,12 +28,25 @@ PROBE: Mapping[str, object] = {
     "z_offset": OFFSET[2],
     "speed": 5,
 }
+KINDS: Mapping[str, Mapping[str, object]] = {
+    "bltouch": {"pin": None, "sensor_pin": "^toolhead:PC5", "control_pin": "toolhead:PB0"}
+}
+"""What other kinds of probes have in their sections."""
 
 
 def machine_text(
-    *, z: Mapping[str, object] | None = None, further_z: int = 0, sections: str = "", **probe: object
+    *,
+    z: Mapping[str, object] | None = None,
+    further_z: int = 0,
+    sections: str = "",
+    kind: str = "probe",
+    **probe: object,
 ) -> str:
-    """Return the configuration: with options of [stepper_z] and [probe], and so many further motors of Z."""
+    """Return the configuration: with options of [stepper_z] and of the probe, and so many further motors of Z.
+
+    KIND: the section of the probe.
+    """
+    options = {**PROBE, **KINDS.get(kind, {}), **probe}
     axis: dict[str, object] = {"rotation_distance": 8, "position_min": -3, "position_max": 200}
     axis |= {"endstop_pin": "probe:z_virtual_endstop", "homing_speed": 8, "second_homing_speed": 3}
     axis |= {"homing_retract_dist": 3} | dict(z or {})
@@ -48,7 +61,7 @@ def machine_text(
             stepper_section(f"stepper_z{number}", f"PD{number}", f"PE{number}", rotation_distance=8)
             for number in range(1, further_z + 1)
         )
-        + section("probe", **{**PROBE, **probe})
+        + section(kind, **{name: value for name, value in options.items() if value is not None})
         + sections
     )
 
