@@ -6,6 +6,9 @@ than the motors.
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from coordinator.runtime.machine import Machine
 from coordinator.simulate.scenario import BusSetting
@@ -84,6 +87,8 @@ class ProbeStage(MachineStage):
         buses = {"can0": BusSetting(loss=Range(loss, loss))} if loss else None
         self.bed = bed or BedSettings()
         self.output: list[str] = []
+        self.on_echo: dict[str, Callable[[], None]] = {}
+        """What is called when a line M118 says that."""
         self.machine: Machine | None = None
         super().__init__(
             path, seed=seed, buses=buses, plant=PlantSettings(seed=seed, start=start, bed=self.bed)
@@ -96,8 +101,19 @@ class ProbeStage(MachineStage):
             self.machine = machine
             on_ready(machine)
 
-        self.print_lines(lines, on_output=lambda told: self.output.append(told.text), on_ready=ready)
+        def hear(told: Any) -> None:
+            self.output.append(told.text)
+            self.on_echo.get(told.text.removeprefix("echo: "), lambda: None)()
+
+        self.print_lines(lines, on_output=hear, on_ready=ready)
         return self.output
+
+    def steps(self, step_pin: str, dir_pin: str, node: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return when a motor made its steps, s, and whether upwards."""
+        at = np.array([at for at, level in self.edges(step_pin, node) if level])
+        turns = [(-np.inf, 0), *self.edges(dir_pin, node)]
+        last = np.searchsorted([turn for turn, _ in turns], at, side="right") - 1
+        return at, np.array([level for _, level in turns], bool)[last]
 
     def fault(self, fault: PlantFault) -> None:
         """Let the probe fail."""
