@@ -8,6 +8,7 @@ the sensitivity and the inverse of that; 131 twice brings its own back.
 import asyncio
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from itertools import pairwise
 from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
@@ -142,11 +143,12 @@ class SmartEffector(Probe):
         begin_s = live.soon()
         clock, bit_ticks = live.ticks_at(self._node, begin_s), BIT_S * node.clock_freq_hz
         bits = [*bits_of(program), 0]
-        before = 0
-        for number, bit in enumerate(bits):
-            if bit != before:
-                output.set(node, clock + round(number * bit_ticks), bool(bit))
-            before = bit
+        changes = [
+            (clock + round(number * bit_ticks), bool(bit))
+            for number, (before, bit) in enumerate(pairwise((0, *bits)))
+            if bit != before
+        ]
+        output.send_burst(node, changes)
         await asyncio.sleep(begin_s + len(bits) * BIT_S + SETTLE_S - live.print_time_now())
 
 
