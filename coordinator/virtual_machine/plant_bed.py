@@ -13,7 +13,6 @@ from coordinator.config.sections.nodes import make_pin_registry
 from nodes.support.errors import CanductorError
 from nodes.virtual.plant import Axis, Bed, Probe, Term
 
-
 _CONTROL: Final = PinOption(name="control_pin", help="", share="plant")
 
 
@@ -28,6 +27,9 @@ class BedSettings:
     """Way up from where it triggers to where it lets go."""
     z_offset_mm: float | None = None
     """How high the nozzle truly is when it triggers; None: as configured."""
+    lean_x: float = 0.0
+    """How much higher it triggers per mm along X, where the axis is twisted; from x0 of the bed on."""
+    lean_y: float = 0.0
     supports: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """X and Y of where each motor of Z carries the frame; none: it cannot tilt. The frame is a plane, where
     more than three carry it the one that fits best."""
@@ -72,6 +74,8 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
         hysteresis=settings.hysteresis_mm,
         noise=settings.noise_mm,
         inverted=pin.invert,
+        lean_x=settings.lean_x,
+        lean_y=settings.lean_y,
         control_pin=_control_pin(description, described.section, pin.node),
     )
     return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, probe)

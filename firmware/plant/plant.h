@@ -93,14 +93,15 @@ struct plant_bltouch {
 // that again, and each approach finds it up to NOISE beside AT.
 // A probe is a switch that the bed presses: it is at OFFSET_X, OFFSET_Y from the nozzle, and pressed when the
 // nozzle is OFFSET_Z above the bed there, or lower. The height of the nozzle is that of AXIS; with slopes
-// (mm per mm, axes as well; -1: none) that height is of x = y = 0 and grows along x and y.
+// (mm per mm, axes as well; -1: none) that height is of x = y = 0 and grows along x and y. A twisted axis
+// makes OFFSET_Z grow by LEAN_X and LEAN_Y per mm that the probe is away from x0, y0 of the bed.
 struct plant_switch {
     char name[PLANT_NAME];
     int pin, axis, direction, inverted;
     double at, hysteresis, noise;
     int bed; // of a probe; -1: it is an endstop
     int x_axis, y_axis, slope_x_axis, slope_y_axis;
-    double offset_x, offset_y, offset_z;
+    double offset_x, offset_y, offset_z, lean_x, lean_y;
     int control_pin; // of a probe with a pin that a servo's signal moves; -1: it has none
     struct plant_bltouch bltouch;
     int pressed;

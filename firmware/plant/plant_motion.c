@@ -125,7 +125,9 @@ double plant_probe_depth(struct plant *plant, const struct plant_switch *it, uin
     double y = settled_position(plant, it->y_axis, ns) + it->offset_y;
     double z = settled_position(plant, it->axis, ns) + x * settled_position(plant, it->slope_x_axis, ns) +
                y * settled_position(plant, it->slope_y_axis, ns);
-    return bed_height(&plant->beds[it->bed], x, y) + it->offset_z - z;
+    const struct plant_bed *bed = &plant->beds[it->bed];
+    double lean = it->lean_x * (x - bed->x0) + it->lean_y * (y - bed->y0);
+    return bed_height(bed, x, y) + it->offset_z + lean - z;
 }
 
 static double switch_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns) {

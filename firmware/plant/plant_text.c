@@ -163,6 +163,8 @@ static int read_probe(const struct plant_reader *reader, char *rest) {
         {"noise", NUMBER, AT(plant_switch, noise), 0, 100, 1},
         {"inverted", FLAG, AT(plant_switch, inverted), 0, 0, 1},
         {"control", PIN, AT(plant_switch, control_pin), 0, 0, 1},
+        {"lean_x", NUMBER, AT(plant_switch, lean_x), -1, 1, 1},
+        {"lean_y", NUMBER, AT(plant_switch, lean_y), -1, 1, 1},
     };
     struct plant *plant = reader->plant;
     if (plant->switch_count == PLANT_SWITCHES)

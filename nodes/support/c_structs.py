@@ -24,7 +24,9 @@ def from_struct(kind: type[T], struct: Any, **others: Any) -> T:
 
     Raises TypeError when a field without a default is in neither.
     """
-    return kind(**{name: getattr(struct, name) for name in _common(kind, typeof(struct))} | others)
+    hashable: Any = kind
+    names = _common(hashable, typeof(struct))
+    return kind(**{name: getattr(struct, name) for name in names} | others)
 
 
 @cache

@@ -75,6 +75,8 @@ def test_its_sensitivity_is_programmed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("line", ["SET_SMART_EFFECTOR SENSITIVITY=20", "RESET_SMART_EFFECTOR"])
 def test_without_a_control_pin_it_is_not_programmed(tmp_path: Path, line: str) -> None:
     stage = ProbeStage(tmp_path, machine_text(kind="smart_effector"))
-    name = line.split()[0]
-    with pytest.raises(Exception, match=rf"{name} needs control_pin of \[smart_effector\], which is not given"):
+    name = line.split(maxsplit=1)[0]
+    with pytest.raises(
+        Exception, match=rf"{name} needs control_pin of \[smart_effector\], which is not given"
+    ):
         stage.do(line)

@@ -45,9 +45,9 @@ def machine_text(
     kind: str = "probe",
     **probe: object,
 ) -> str:
-    """Return the configuration: with options of [stepper_z] and of the probe, and so many further motors of Z.
+    """Return the configuration: with options of [stepper_z] and of the probe, whose section is KIND.
 
-    KIND: the section of the probe.
+    Z has so many further motors.
     """
     options = {**PROBE, **KINDS.get(kind, {}), **probe}
     axis: dict[str, object] = {"rotation_distance": 8, "position_min": -3, "position_max": 200}

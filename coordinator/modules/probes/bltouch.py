@@ -1,8 +1,8 @@
 """[bltouch]: a probe whose pin is moved by a servo's signal, as that of ANTCLABS and its copies.
 
-A command is the length of the pulses on the control pin. A new length begins in the gap between two pulses, so
-that no pulse is cut: the probe would read it as another command. By its data sheet the probe has two modes.
-In that of ``pin_down`` the touch raises a short pulse, and the pin goes up by itself; in touch mode the
+A command is the length of the pulses on the control pin. A new length begins in the gap between two pulses,
+so that no pulse is cut: the probe would read it as another command. By its data sheet the probe has two
+modes. In that of ``pin_down`` the touch raises a short pulse, and the pin goes up by itself; in touch mode the
 sensor shows for as long as it lasts whether the pin is in. What the pin does is checked: after ``pin_down``
 the sensor has to be open, and after ``pin_up`` touch mode has to show that the pin is in.
 """
@@ -41,6 +41,8 @@ PULSES_S: Final = {
 """Length of the pulses of each command, by the data sheet."""
 HOLD_S: Final = 0.1
 """How long a command is sent at least."""
+LEAD_S: Final = 0.25
+"""From when a command is sent to the node to its begin there: a host that is slower for once stops the node."""
 RESET_S: Final = 0.5
 """What a reset takes."""
 ATTEMPTS: Final = 3
@@ -113,7 +115,9 @@ class BLTouch(Probe):
         self._output_mode = build.find(OUTPUT_MODE)
         pin = build.pin(CONTROL_PIN)
         self._node = pin.node
-        self._output = PwmOut("the control pin of [bltouch]", pin=pin.name, cycle_s=CYCLE_S, invert=pin.invert)
+        self._output = PwmOut(
+            "the control pin of [bltouch]", pin=pin.name, cycle_s=CYCLE_S, invert=pin.invert
+        )
         build.add_device(pin.node, self._output, pin)
         build.add_device(pin.node, self)
         self._begun_clock: int | None = None
@@ -148,7 +152,7 @@ class BLTouch(Probe):
         """Send COMMAND, for HOLD_S at least; raises CanductorError."""
         live = self.live
         node = live.node(self._node)
-        soon_s = live.soon()
+        soon_s = live.print_time_now() + LEAD_S
         soon = clock = live.ticks_at(self._node, soon_s)
         if self._begun_clock is not None:
             cycle = round(CYCLE_S * node.clock_freq_hz)
@@ -203,8 +207,8 @@ class BLTouch(Probe):
             await self._reset()
         self._is_down = False
         raise NotReadyError(
-            f"the BLTouch did not lower its pin: {ATTEMPTS} times its sensor was triggered after pin_down; lift"
-            " the head, and check that the pin moves freely, and the wiring"
+            f"the BLTouch did not lower its pin: {ATTEMPTS} times its sensor was triggered after pin_down;"
+            " lift the head, and check that the pin moves freely, and the wiring"
         )
 
     async def _raise_pin(self) -> None:
@@ -263,7 +267,9 @@ class BLTouch(Probe):
         asked = call.parameters("MODE").get("MODE", "")
         mode = asked.upper()
         if mode not in OUTPUT_MODES:
-            raise WordError(f"MODE of BLTOUCH_STORE is {quoted(asked)}; {' or '.join(OUTPUT_MODES)} is possible")
+            raise WordError(
+                f"MODE of BLTOUCH_STORE is {quoted(asked)}; {' or '.join(OUTPUT_MODES)} is possible"
+            )
 
         set_mode = f"set_{mode.lower()}_output_mode"
 

@@ -180,7 +180,7 @@ class Probe(ProbeEndstop):
         self._deactivate = GCodeTemplate(build, DEACTIVATE) if self.HAS_LINES else None
         self._each = not self.HAS_LINES or build.get(EACH)
         self.corrections: list[Callable[[float, float], float]] = []
-        """What is added to a measured height, mm, by X and Y of the nozzle."""
+        """What is added to a measured height, mm, by X and Y of the probe."""
         if downwards(build.machine) is None:
             raise ConfigError(
                 build.place,
@@ -354,7 +354,7 @@ class Probe(ProbeEndstop):
 
     def _correction(self, contact: Contact) -> float:
         x, y, _ = contact.trigger
-        return sum(correction(x, y) for correction in self.corrections)
+        return sum(correction(x + self.offset[0], y + self.offset[1]) for correction in self.corrections)
 
     def _found(self, contact: Contact, height: float) -> Measured:
         x, y, _ = contact.trigger

@@ -1,8 +1,8 @@
 """[smart_effector]: the nozzle as probe, on strain gauges whose sensitivity is programmed.
 
 The effector reads its program from the control pin, at 1000 bits per second: each byte comes as 0 0 1 0, four
-bits, the inverse of the last one, four bits, the inverse of the last one; the highest bit first. It stores 105,
-the sensitivity and the inverse of that; 131 twice brings its own back.
+bits, the inverse of the last one, four bits, the inverse of the last one; the highest bit first. It stores
+105, the sensitivity and the inverse of that; 131 twice brings its own back.
 """
 
 import asyncio
