@@ -15,6 +15,7 @@ from coordinator.simulate.scenario import BusSetting
 from coordinator.support.toml_values import Range
 from coordinator.virtual_machine.plant import PlantSettings
 from coordinator.virtual_machine.plant_bed import BedSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.virtual.plant import Bed
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.stages.machine_stage import MachineStage
@@ -80,6 +81,7 @@ class ProbeStage(MachineStage):
         seed: int = 1,
         loss: float = 0.0,
         bed: BedSettings | None = None,
+        heat: HeatSettings | None = None,
         start: tuple[float, float, float] = START,
     ) -> None:
         path = folder / "probe.cfg"
@@ -90,9 +92,8 @@ class ProbeStage(MachineStage):
         self.on_echo: dict[str, Callable[[], None]] = {}
         """What is called when a line M118 says that."""
         self.machine: Machine | None = None
-        super().__init__(
-            path, seed=seed, buses=buses, plant=PlantSettings(seed=seed, start=start, bed=self.bed)
-        )
+        plant = PlantSettings(seed=seed, start=start, bed=self.bed, heat=heat or HeatSettings())
+        super().__init__(path, seed=seed, buses=buses, plant=plant)
 
     def do(self, *lines: str, on_ready: Callable[[Machine], None] = lambda _: None) -> list[str]:
         """Run LINES as a program; return what it said."""
