@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -49,7 +50,8 @@ def published_lines() -> str:
 
 
 def test_a_nozzle_that_is_too_hot_cools_before_it_touches_the_bed(tmp_path: Path) -> None:
-    options = {"x_offset": 0, "y_offset": 0, "z_offset": TRIGGER_MM, "activate_gcode": published_lines()}
+    options: dict[str, Any] = {"x_offset": 0, "y_offset": 0, "z_offset": TRIGGER_MM}
+    options["activate_gcode"] = published_lines()
     text = machine_text(sections=section("extruder", **EXTRUDER), **options)
     heat = HeatSettings(hurry=10, warm_c={"extruder": 60})
     stage = ProbeStage(tmp_path, text, bed=TILTED, heat=heat)

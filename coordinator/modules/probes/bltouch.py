@@ -1,10 +1,12 @@
 """[bltouch]: a probe whose pin is moved by a servo's signal, as that of ANTCLABS and its copies.
 
 A command is the length of the pulses on the control pin. A new length begins in the gap between two pulses,
-so that no pulse is cut: the probe would read it as another command. By its data sheet the probe has two
-modes. In that of ``pin_down`` the touch raises a short pulse, and the pin goes up by itself; in touch mode the
-sensor shows for as long as it lasts whether the pin is in. What the pin does is checked: after ``pin_down``
-the sensor has to be open, and after ``pin_up`` touch mode has to show that the pin is in.
+so that no pulse is cut: the probe would read it as another command.
+
+By its data sheet the probe has two modes. In that of ``pin_down`` the touch raises a short pulse, and the pin
+goes up by itself; in touch mode the sensor shows for as long as it lasts whether the pin is in. What the pin
+does is checked: after ``pin_down`` the sensor has to be open, and after ``pin_up`` touch mode has to show
+that the pin is in.
 """
 
 import asyncio
@@ -42,7 +44,7 @@ PULSES_S: Final = {
 HOLD_S: Final = 0.1
 """How long a command is sent at least."""
 LEAD_S: Final = 0.25
-"""From when a command is sent to the node to its begin there: a host that is slower for once stops the node."""
+"""How far ahead commands are sent to the node: late ones would stop it, and hosts are sometimes slow."""
 RESET_S: Final = 0.5
 """What a reset takes."""
 ATTEMPTS: Final = 3
