@@ -10,6 +10,7 @@ from coordinator.virtual_machine.plant_bed import BedSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.virtual.plant import Bed
 from tests.stages.printer_text import section
+from tests.profiles import is_full
 from tests.stages.probe_stage import MICROSTEP_MM, ProbeStage, bed_height, heights, machine_text
 
 REAL = Path(__file__).parents[3] / "shared/data/config/real/users"
@@ -49,6 +50,7 @@ def published_lines() -> str:
     return "\n" + lines.rstrip().replace("PROBE_TEMP = 150", f"PROBE_TEMP = {PROBE_C}")
 
 
+@pytest.mark.skipif(not is_full(), reason="thorough only: a real Tap is homed in test_real_levelling.py")
 def test_a_nozzle_that_is_too_hot_cools_before_it_touches_the_bed(tmp_path: Path) -> None:
     options: dict[str, Any] = {"x_offset": 0, "y_offset": 0, "z_offset": TRIGGER_MM}
     options["activate_gcode"] = published_lines()
