@@ -9,8 +9,8 @@ import pytest
 from coordinator.virtual_machine.plant_bed import BedSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.virtual.plant import Bed
-from tests.stages.printer_text import section
 from tests.profiles import is_full
+from tests.stages.printer_text import section
 from tests.stages.probe_stage import MICROSTEP_MM, ProbeStage, bed_height, heights, machine_text
 
 REAL = Path(__file__).parents[3] / "shared/data/config/real/users"
