@@ -167,9 +167,14 @@ class BLTouch(Probe):
 
     # ---------------------------------------------------------------------------------------------- its pin
 
+    @property
+    def stays_deployed(self) -> bool:
+        """Whether the pin stays down between the measurements of a command."""
+        return not self._stow_each
+
     async def begin(self) -> None:
         """Note that what follows are measurements of one command."""
-        self._keeps_down = not self._stow_each
+        self._keeps_down = True
 
     async def finish(self) -> None:
         """Raise the pin, if it is down."""

@@ -147,8 +147,8 @@ LINE_OPTIONS: Final[tuple[Option[Any], ...]] = (ACTIVATE, DEACTIVATE, EACH)
 class Probe(ProbeEndstop):
     """The probe; PROBE and the like are in probe_commands.py, the kinds of probes in files of their own.
 
-    A kind declares INPUT; one that has to be deployed or waited for overrides ``touching``, ``begin`` and
-    ``finish``, which all run at standstill.
+    A kind declares INPUT; one that has to be deployed or waited for overrides ``touching``, or with
+    ``stays_deployed`` also ``begin`` and ``finish``; all of them run at standstill.
     """
 
     SHOWN_AS = "probe"
@@ -271,6 +271,11 @@ class Probe(ProbeEndstop):
         node = self.live.node(machine.devices.endstop_node(described.rail))
         return (await machine.devices.endstops[described.rail.axis].state(node)).pressed
 
+    @property
+    def stays_deployed(self) -> bool:
+        """Whether it stays deployed between the measurements of a command, from ``begin`` to ``finish``."""
+        return False
+
     async def begin(self) -> None:
         """Begin to measure the places of one command, at standstill."""
 
@@ -281,11 +286,13 @@ class Probe(ProbeEndstop):
         """Make ready for the places of COMMAND."""
         if not self._each:
             yield from self._run_lines(job, command, self._activate)
-        yield AtStandstill(self.begin)
+        if self.stays_deployed:
+            yield AtStandstill(self.begin)
 
     def stow(self, job: ProgramContext, command: Command) -> Iterator[Reading]:
         """Put away what ``deploy`` made ready."""
-        yield AtStandstill(self.finish)
+        if self.stays_deployed:
+            yield AtStandstill(self.finish)
         if not self._each:
             yield from self._run_lines(job, command, self._deactivate)
 
