@@ -194,9 +194,10 @@ class BLTouch(Probe):
         try:
             yield
         except BaseException:
-            self._keeps_down = False
-            with suppress(CanductorError):  # what was wrong before is what counts
-                await self._raise_pin()
+            self._keeps_down = self._is_down = False
+            if self.live.machine.stopped is None:
+                with suppress(CanductorError):  # what was wrong before is what counts; the next use looks
+                    await self._send("pin_up")
             raise
         if not self._keeps_down:
             await self._raise_pin()
