@@ -68,7 +68,8 @@ def test_what_the_nozzle_finds_by_hand_makes_the_probe_find_a_flat_bed(tmp_path:
     assert saved[f"compensation_end_{letter}"] == f"{PLACES[axis][-1]}"
     pin, turn = ("PB0", "PB1") if axis == "X" else ("PB3", "PB4")
     at, _ = stage.steps(pin, turn, "mcu")
-    assert 1 / np.diff(at).min() / 80 == pytest.approx(OPTIONS["speed"], rel=0.02)
+    # The way from the place of the nozzle to that of the next probing leads along the other axis, too.
+    assert 0.95 < 1 / np.diff(at).min() / 80 / OPTIONS["speed"] < 1.02
 
 
 def test_saved_compensations_of_both_axes_act_after_a_start(tmp_path: Path) -> None:
