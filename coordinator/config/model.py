@@ -187,6 +187,8 @@ class ProbeDescription:
     """Whose endstop it is: Z, or else one of its own with the name ``probe``."""
     offset: Point
     """From the nozzle: X, Y, and how high that is above the bed when it triggers, mm."""
+    section: str
+    """Its section: ``bltouch``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,6 +63,8 @@ class ProbeSwitch:
     pin: PinName
     offset: tuple[float, float, float]
     """Of the probe from the nozzle, mm."""
+    section: str
+    """Its section: ``bltouch``."""
 
 
 NO_PIN = PinName(PRIMARY_NODE, "")
@@ -129,7 +131,7 @@ class PinRegistry:
     multi_pins: set[str] = field(default_factory=set)
     """Names of the sections [multi_pin NAME], whose pins are all behind ``multi_pin:``."""
     probe: ProbeSwitch | None = None
-    """The input of [probe], which ``probe:z_virtual_endstop`` stands for."""
+    """The input of the probe, which ``probe:z_virtual_endstop`` stands for."""
 
     def copy(self) -> "PinRegistry":
         """Return an independent copy."""

@@ -58,6 +58,8 @@ class Module:
     """Whether, where there may be several, one may be without a name."""
     READS: ClassVar[str] = ""
     """A pattern of section names: it reads further options of sections that the machine itself reads."""
+    SHOWN_AS: ClassVar[str] = ""
+    """Under which name macros and front ends see its status; empty: under that of its section."""
     TITLE: ClassVar[str] = ""
     """How these sections are shown: ``[extruder], [extruder1] …``."""
 

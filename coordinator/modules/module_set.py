@@ -409,4 +409,6 @@ class ModuleSet:
 
     def status(self) -> Mapping[str, Mapping[str, Value]]:
         """Return the status of each module, by the name of its section."""
-        return {module.name: status for module in self._modules if (status := module.status())}
+        return {
+            module.SHOWN_AS or module.name: status for module in self._modules if (status := module.status())
+        }

@@ -2,11 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 
+from coordinator.config.file import parse_config
 from coordinator.config.model import MachineDescription
+from coordinator.config.pins import PinOption
+from coordinator.config.sections.nodes import make_pin_registry
+from nodes.support.errors import CanductorError
 from nodes.virtual.plant import Axis, Bed, Probe, Term
+
+_CONTROL: Final = PinOption(name="control_pin", help="", share="plant")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,6 +27,9 @@ class BedSettings:
     """Way up from where it triggers to where it lets go."""
     z_offset_mm: float | None = None
     """How high the nozzle truly is when it triggers; None: as configured."""
+    lean_x: float = 0.0
+    """How much higher it triggers per mm along X, where the axis is twisted; from x0 of the bed on."""
+    lean_y: float = 0.0
     supports: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """X and Y of where each motor of Z carries the frame; none: it cannot tilt. The frame is a plane, where
     more than three carry it the one that fits best."""
@@ -64,8 +74,27 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
         hysteresis=settings.hysteresis_mm,
         noise=settings.noise_mm,
         inverted=pin.invert,
+        lean_x=settings.lean_x,
+        lean_y=settings.lean_y,
+        control_pin=_control_pin(description, described.section, pin.node),
     )
     return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, probe)
+
+
+def _control_pin(description: MachineDescription, section: str, node: str) -> str | None:
+    """Return the pin that moves the pin of a BLTouch; None: SECTION is another kind of probe."""
+    if section != "bltouch":
+        return None
+    config = parse_config(description.path)
+    given, registry = config.sections[section], make_pin_registry(config, description.nodes)
+    name = _CONTROL.parse(given.options[_CONTROL.name].value)
+    pin = registry.claim(name, _CONTROL, given)
+    if pin.node != node:
+        raise CanductorError(
+            f"[{section}] has its sensor_pin on node {node} and its control_pin on {pin.node}; the plant of a"
+            " demo can only have both on one node"
+        )
+    return pin.name
 
 
 def frame_axes(description: MachineDescription, z: Axis, settings: BedSettings) -> tuple[Axis, Axis, Axis]:

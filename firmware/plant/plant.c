@@ -93,8 +93,12 @@ void plant_output(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
     if (!plant->writes[pin])
         return;
     set_lines(plant, ns, pin, value);
-    if (stepped)
+    if (stepped) {
         plant_motion_edge(plant, ns, pin, value);
+        for (int i = 0; i < plant->switch_count; i++)
+            if (plant->switches[i].control_pin == (int)pin)
+                plant_bltouch_edge(plant, &plant->switches[i], ns, value);
+    }
     drive_pin(plant, ns, pin, value);
 }
 
@@ -316,8 +320,11 @@ static void note_pins(struct plant *plant) {
         if (plant->fans[i].tach_pin >= 0)
             plant->reads[plant->fans[i].tach_pin] = 1;
     }
-    for (int i = 0; i < plant->switch_count; i++)
+    for (int i = 0; i < plant->switch_count; i++) {
         plant->reads[plant->switches[i].pin] = 1;
+        if (plant->switches[i].control_pin >= 0)
+            plant->writes[plant->switches[i].control_pin] = 1;
+    }
     for (int i = 0; i < plant->sensor_count; i++)
         plant->reads[plant->sensors[i].pin] = 1;
     for (int i = 0; i < plant->tmc_count; i++)

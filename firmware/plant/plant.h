@@ -80,18 +80,30 @@ struct plant_bed {
     double z, x0, y0, tilt_x, tilt_y, bow, radius;
 };
 
+// What moves the pin of a BLTouch: a servo's signal, whose pulses are commands by their lengths. Two equal
+// pulses are needed. Out: the pin is down.
+struct plant_bltouch {
+    uint64_t rise_ns;
+    int heard, command; // of the last pulse, what is being done; 0: none
+    int lowers, out, touch_mode, alarm;
+    uint64_t moved_ns, pulse_ns; // when the pin is where it is to be, until when its touch is shown
+};
+
 // Pressed (high, or low when inverted) from AT on in DIRECTION (1 or -1). It is released HYSTERESIS before
 // that again, and each approach finds it up to NOISE beside AT.
 // A probe is a switch that the bed presses: it is at OFFSET_X, OFFSET_Y from the nozzle, and pressed when the
 // nozzle is OFFSET_Z above the bed there, or lower. The height of the nozzle is that of AXIS; with slopes
-// (mm per mm, axes as well; -1: none) that height is of x = y = 0 and grows along x and y.
+// (mm per mm, axes as well; -1: none) that height is of x = y = 0 and grows along x and y. A twisted axis
+// makes OFFSET_Z grow by LEAN_X and LEAN_Y per mm that the probe is away from x0, y0 of the bed.
 struct plant_switch {
     char name[PLANT_NAME];
     int pin, axis, direction, inverted;
     double at, hysteresis, noise;
     int bed; // of a probe; -1: it is an endstop
     int x_axis, y_axis, slope_x_axis, slope_y_axis;
-    double offset_x, offset_y, offset_z;
+    double offset_x, offset_y, offset_z, lean_x, lean_y;
+    int control_pin; // of a probe with a pin that a servo's signal moves; -1: it has none
+    struct plant_bltouch bltouch;
     int pressed;
     double shift; // of this approach
     uint64_t switched;
@@ -258,6 +270,10 @@ double plant_axis_position(struct plant *plant, struct plant_axis *axis, uint64_
 int plant_switch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns);
 int64_t plant_term_count(struct plant *plant, struct plant_term *term, uint64_t ns);
 void plant_steps_lost(struct plant *plant, uint64_t ns, int stepper, uint64_t steps);
+double plant_probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns);
+// plant_bltouch.c
+void plant_bltouch_edge(struct plant *plant, struct plant_switch *it, uint64_t ns, int level);
+int plant_bltouch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns, uint32_t fault);
 // plant_tmc.c
 void plant_tmc_start(struct plant *plant, struct plant_tmc *tmc, uint64_t ns);
 void plant_tmc_look(struct plant *plant, struct plant_tmc *tmc, uint64_t ns); // takes what has come since

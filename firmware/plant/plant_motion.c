@@ -6,6 +6,7 @@
 
 // Threshold and place are sums of products: steps that meet exactly on paper may miss by their rounding.
 static const double ROUNDING = 1e-9;
+static const double LATE_MM = 0.2;
 
 int64_t plant_term_count(struct plant *plant, struct plant_term *term, uint64_t ns) {
     struct plant_reference *stepper = &term->stepper;
@@ -119,17 +120,19 @@ static double settled_position(struct plant *plant, int axis, uint64_t ns) {
 }
 
 // How far the bed has pushed a probe in.
-static double probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns) {
+double plant_probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns) {
     double x = settled_position(plant, it->x_axis, ns) + it->offset_x;
     double y = settled_position(plant, it->y_axis, ns) + it->offset_y;
     double z = settled_position(plant, it->axis, ns) + x * settled_position(plant, it->slope_x_axis, ns) +
                y * settled_position(plant, it->slope_y_axis, ns);
-    return bed_height(&plant->beds[it->bed], x, y) + it->offset_z - z;
+    const struct plant_bed *bed = &plant->beds[it->bed];
+    double lean = it->lean_x * (x - bed->x0) + it->lean_y * (y - bed->y0);
+    return bed_height(bed, x, y) + it->offset_z + lean - z;
 }
 
 static double switch_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns) {
     if (it->bed >= 0)
-        return probe_depth(plant, it, ns);
+        return plant_probe_depth(plant, it, ns);
     return it->direction * (settled_position(plant, it->axis, ns) - it->at);
 }
 
@@ -138,7 +141,11 @@ static int is_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns)
     uint32_t fault = atomic_load_explicit(&item->fault, memory_order_relaxed);
     if (fault == PLANT_NEVER || fault == PLANT_ALWAYS)
         return fault == PLANT_ALWAYS;
-    double needed = it->pressed ? -it->hysteresis : 0.0;
+    if (it->control_pin >= 0)
+        return plant_bltouch_pressed(plant, it, ns, fault);
+    if (fault == PLANT_STUCK)
+        return it->pressed;
+    double needed = (it->pressed ? -it->hysteresis : 0.0) + (fault == PLANT_LATE ? LATE_MM : 0.0);
     return switch_depth(plant, it, ns) - it->shift >= needed - ROUNDING;
 }
 

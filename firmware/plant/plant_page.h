@@ -48,6 +48,9 @@ enum plant_fault {
     PLANT_GARBLED,
     PLANT_WARM,
     PLANT_OVERHEATED,
+    // A switch stays as it is, of a BLTouch the pin; it closes a fifth of a millimetre late.
+    PLANT_STUCK,
+    PLANT_LATE,
 };
 
 struct plant_step {

@@ -120,7 +120,7 @@ static int read_switch(const struct plant_reader *reader, char *rest) {
     if (plant->switch_count == PLANT_SWITCHES)
         return plant_text_fail(reader, "switch", "too many");
     struct plant_switch *it = &plant->switches[plant->switch_count++];
-    it->bed = -1;
+    it->bed = it->control_pin = -1;
     return plant_text_fields(reader, FIELDS(fields), rest, it);
 }
 
@@ -162,12 +162,15 @@ static int read_probe(const struct plant_reader *reader, char *rest) {
         {"hysteresis", NUMBER, AT(plant_switch, hysteresis), 0, 100, 1},
         {"noise", NUMBER, AT(plant_switch, noise), 0, 100, 1},
         {"inverted", FLAG, AT(plant_switch, inverted), 0, 0, 1},
+        {"control", PIN, AT(plant_switch, control_pin), 0, 0, 1},
+        {"lean_x", NUMBER, AT(plant_switch, lean_x), -1, 1, 1},
+        {"lean_y", NUMBER, AT(plant_switch, lean_y), -1, 1, 1},
     };
     struct plant *plant = reader->plant;
     if (plant->switch_count == PLANT_SWITCHES)
         return plant_text_fail(reader, "probe", "too many switches");
     struct plant_switch *it = &plant->switches[plant->switch_count++];
-    it->slope_x_axis = it->slope_y_axis = -1;
+    it->slope_x_axis = it->slope_y_axis = it->control_pin = -1;
     it->direction = -1;
     return plant_text_fields(reader, FIELDS(fields), rest, it);
 }

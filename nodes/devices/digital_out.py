@@ -1,5 +1,6 @@
 """A digital output on a node."""
 
+from collections.abc import Iterable
 from typing import Final
 
 from nodes.devices.timed_output import TimedOutput
@@ -45,6 +46,14 @@ class DigitalOut(TimedOutput):
     def set(self, node: Node, clock: int, on: bool) -> None:
         """Switch it at CLOCK (64 bits, later than now by the transit time to the node)."""
         self._queue(node, clock, self._level(on))
+
+    def send_burst(self, node: Node, changes: Iterable[tuple[int, bool]]) -> None:
+        """Switch it at clocks that follow closely; only where NODE makes no steps until then.
+
+        The changes are sent at once and take the slots of steps, too. Raises NodeError.
+        """
+        for clock, on in changes:
+            self._send(node, self._oid, clock, self._level(on))
 
     def set_now(self, node: Node, on: bool) -> None:
         """Switch it when the command arrives; not while a value of ``set`` is pending."""

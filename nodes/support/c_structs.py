@@ -1,6 +1,7 @@
 """Conversion of C structs to dataclasses, by the fields of the cffi declaration."""
 
 from dataclasses import fields
+from functools import cache
 from typing import Any, TypeVar
 
 from _cffi_backend import typeof  # not cffi.FFI: that imports a parser of C
@@ -10,7 +11,10 @@ T = TypeVar("T")
 
 def field_names(struct: Any) -> list[str]:
     """Return the names of the fields of a struct, or of what a pointer points to."""
-    kind = typeof(struct)
+    return _names(typeof(struct))
+
+
+def _names(kind: Any) -> list[str]:
     kind = kind.item if kind.kind == "pointer" else kind
     return [name for name, _ in kind.fields or ()]
 
@@ -20,5 +24,13 @@ def from_struct(kind: type[T], struct: Any, **others: Any) -> T:
 
     Raises TypeError when a field without a default is in neither.
     """
-    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]  # any dataclass
-    return kind(**{name: getattr(struct, name) for name in field_names(struct) if name in names} | others)
+    hashable: Any = kind
+    names = _common(hashable, typeof(struct))
+    return kind(**{name: getattr(struct, name) for name in names} | others)
+
+
+@cache
+def _common(kind: type[Any], struct: Any) -> tuple[str, ...]:
+    """Return the names of the fields that KIND and the C type STRUCT have in common."""
+    names = {field.name for field in fields(kind)}
+    return tuple(name for name in _names(struct) if name in names)

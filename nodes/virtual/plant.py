@@ -117,6 +117,11 @@ class Probe:
     noise: float = 0.0
     inverted: bool = False
     """Pressed is a low level."""
+    control_pin: str | None = None
+    """Input of a BLTouch for the servo's signal that moves its pin; None: it is a plain switch."""
+    lean_x: float = 0.0
+    """By how much OFFSET_Z grows per mm that the probe is away from x0 of the bed: of a twisted axis."""
+    lean_y: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -268,6 +273,7 @@ _FIELD_NAMES: Final = {
     "dir_pin": "dir",
     "enable_pin": "enable",
     "tach_pin": "tach",
+    "control_pin": "control",
     "tx_pin": "tx",
     "rx_pin": "rx",
 }

@@ -73,6 +73,10 @@ class PlantFault(IntEnum):
     """A driver that reports its overtemperature warning."""
     OVERHEATED = 10
     """A driver that switched off because of its temperature."""
+    STUCK = 11
+    """A switch that stays as it is; of a BLTouch the pin does."""
+    LATE = 12
+    """A switch that closes 0.2 mm late."""
 
 
 _FAULTS: Final[Mapping[PlantItemKind, tuple[PlantFault, ...]]] = {
@@ -80,7 +84,7 @@ _FAULTS: Final[Mapping[PlantItemKind, tuple[PlantFault, ...]]] = {
     PlantItemKind.HEATER: (PlantFault.STUCK_ON, PlantFault.DEAD),
     PlantItemKind.FAN: (PlantFault.DEAD,),
     PlantItemKind.SENSOR: (PlantFault.OPEN, PlantFault.SHORTED, PlantFault.FALLEN),
-    PlantItemKind.SWITCH: (PlantFault.NEVER, PlantFault.ALWAYS),
+    PlantItemKind.SWITCH: (PlantFault.NEVER, PlantFault.ALWAYS, PlantFault.STUCK, PlantFault.LATE),
     PlantItemKind.TMC: (
         PlantFault.OPEN,
         PlantFault.SHORTED,

@@ -11,8 +11,8 @@ from tests.stages.served import Served
 NOT_ACTING = """
 [stepper_z]
 endstop_pin: probe:z_virtual_endstop
-[bltouch]
-sensor_pin: PA9
+[dockable_probe]
+pin: PA9
 z_offset: 1
 [bed_mesh]
 mesh_min: 10, 10

@@ -134,7 +134,7 @@ def test_speeds_and_the_lift_are_as_configured(tmp_path: Path) -> None:
     text = machine_text(speed=2, lift_speed=10, samples=2, sample_retract_dist=1.5)
     stage = ProbeStage(tmp_path, text)
     stage.do("G28", "G1 Z2.5 F900", "M400", "PROBE")
-    at, up = _steps(stage)
+    at, up = stage.steps("PB6", "PB7", "mcu")
     last_down = np.flatnonzero(up)[-1] + 1  # behind the lift between the samples
     lift = up[:last_down]
     lifted = last_down - np.flatnonzero(~lift)[-1] - 1
@@ -143,14 +143,6 @@ def test_speeds_and_the_lift_are_as_configured(tmp_path: Path) -> None:
     assert MICROSTEP_MM / down_s == pytest.approx(2.0, rel=0.03)
     up_s = np.diff(at[last_down - lifted : last_down]).min()
     assert MICROSTEP_MM / up_s == pytest.approx(10.0, rel=0.03)
-
-
-def _steps(stage: ProbeStage) -> tuple[np.ndarray, np.ndarray]:
-    """Return when the motor of Z made its steps, s, and whether upwards."""
-    steps = [at for at, level in stage.edges("PB6", "mcu") if level]
-    turns = stage.edges("PB7", "mcu")
-    ups = [next((level for at, level in reversed(turns) if at <= step), 0) for step in steps]
-    return np.array(steps), np.array(ups, bool)
 
 
 @pytest.mark.parametrize(("each", "times"), [(True, 3), (False, 1)])

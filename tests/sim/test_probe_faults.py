@@ -16,7 +16,7 @@ from nodes.virtual.plant_page import PlantFault
 from tests.profiles import is_full
 from tests.stages.probe_stage import OFFSET, ProbeStage, bed_height, machine_text
 
-SEEDS = 200 if is_full() else 6
+SEEDS = 200 if is_full() else 8
 LOWEST_MM = -0.5
 """position_min of Z."""
 SPEED = 8.0
@@ -26,7 +26,14 @@ TIMEOUT_S = 0.25
 DEEPEST_MM = max(TIMEOUT_S * SPEED - OFFSET[2], -LOWEST_MM + 0.5) + 0.15
 """How far below the bed the nozzle may get: what a node goes on without the others, or 0.5 mm below
 position_min; and what the bed is higher elsewhere."""
-FAULTS = ("none", "never", "always", "cut toolhead", "cut mcu", "stall")
+FAULTS = ("none", "never", "always", "cut toolhead", "cut mcu", "stall", "stuck", "late")
+KINDS = ("probe", "bltouch")
+SWITCH_FAULTS = {
+    "never": PlantFault.NEVER,
+    "always": PlantFault.ALWAYS,
+    "stuck": PlantFault.STUCK,
+    "late": PlantFault.LATE,
+}
 EXPLAINED = (
     r"the probe did not trigger within \d+\.\d+ mm: .*; (Z is -?\d|the head was lowered)",
     r"the probe was triggered before the move: lift the head.*; (Z is -?\d|the head was lowered)",
@@ -35,6 +42,8 @@ EXPLAINED = (
     # A probe that closes by itself on the way down, and a host that stood still while the head travelled.
     r"the samples are \d+\.\d+ mm apart, more than samples_tolerance",
     r"node mcu shut down: Stepper too far in past",
+    r"node toolhead shut down: Timer too close",
+    r"the BLTouch did not (lower|raise) its pin: 3 times .*; (Z is -?\d|the head was lowered)",
     r"arming its nodes took too long",
 )
 
@@ -48,7 +57,9 @@ class Case:
             x0=100, y0=100, tilt_x=chance.uniform(-5e-4, 5e-4), tilt_y=chance.uniform(-5e-4, 5e-4), radius=150
         )
         self.fault = FAULTS[seed % len(FAULTS)]
-        text = machine_text(z={"position_min": LOWEST_MM, "homing_speed": SPEED}, speed=chance.uniform(1, 6))
+        z = {"position_min": LOWEST_MM, "homing_speed": SPEED}
+        kind = KINDS[seed // len(FAULTS) % len(KINDS)] if is_full() else KINDS[seed % 3 // 2]
+        text = machine_text(z=z, kind=kind, speed=chance.uniform(1, 6))
         bed = BedSettings(shape=shape, noise_mm=chance.uniform(0, 0.02), hysteresis_mm=chance.uniform(0, 0.2))
         start = (0.0, 0.0, chance.uniform(4, 14))
         self.stage = ProbeStage(
@@ -84,7 +95,7 @@ class Case:
         elif self.fault == "stall":
             self.stage.stage.stall(0.6)
         elif self.fault != "none":
-            self.stage.fault(PlantFault.NEVER if self.fault == "never" else PlantFault.ALWAYS)
+            self.stage.fault(SWITCH_FAULTS[self.fault])
 
     def run(self) -> str:
         """Home, and probe some places; return how it ended."""

@@ -6,12 +6,16 @@ than the motors.
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from coordinator.runtime.machine import Machine
 from coordinator.simulate.scenario import BusSetting
 from coordinator.support.toml_values import Range
 from coordinator.virtual_machine.plant import PlantSettings
 from coordinator.virtual_machine.plant_bed import BedSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.virtual.plant import Bed
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.stages.machine_stage import MachineStage
@@ -28,12 +32,25 @@ PROBE: Mapping[str, object] = {
     "z_offset": OFFSET[2],
     "speed": 5,
 }
+KINDS: Mapping[str, Mapping[str, object]] = {
+    "bltouch": {"pin": None, "sensor_pin": "^toolhead:PC5", "control_pin": "toolhead:PB0"}
+}
+"""What other kinds of probes have in their sections."""
 
 
 def machine_text(
-    *, z: Mapping[str, object] | None = None, further_z: int = 0, sections: str = "", **probe: object
+    *,
+    z: Mapping[str, object] | None = None,
+    further_z: int = 0,
+    sections: str = "",
+    kind: str = "probe",
+    **probe: object,
 ) -> str:
-    """Return the configuration: with options of [stepper_z] and [probe], and so many further motors of Z."""
+    """Return the configuration: with options of [stepper_z] and of the probe, whose section is KIND.
+
+    Z has so many further motors.
+    """
+    options = {**PROBE, **KINDS.get(kind, {}), **probe}
     axis: dict[str, object] = {"rotation_distance": 8, "position_min": -3, "position_max": 200}
     axis |= {"endstop_pin": "probe:z_virtual_endstop", "homing_speed": 8, "second_homing_speed": 3}
     axis |= {"homing_retract_dist": 3} | dict(z or {})
@@ -48,7 +65,7 @@ def machine_text(
             stepper_section(f"stepper_z{number}", f"PD{number}", f"PE{number}", rotation_distance=8)
             for number in range(1, further_z + 1)
         )
-        + section("probe", **{**PROBE, **probe})
+        + section(kind, **{name: value for name, value in options.items() if value is not None})
         + sections
     )
 
@@ -64,6 +81,7 @@ class ProbeStage(MachineStage):
         seed: int = 1,
         loss: float = 0.0,
         bed: BedSettings | None = None,
+        heat: HeatSettings | None = None,
         start: tuple[float, float, float] = START,
     ) -> None:
         path = folder / "probe.cfg"
@@ -71,10 +89,11 @@ class ProbeStage(MachineStage):
         buses = {"can0": BusSetting(loss=Range(loss, loss))} if loss else None
         self.bed = bed or BedSettings()
         self.output: list[str] = []
+        self.on_echo: dict[str, Callable[[], None]] = {}
+        """What is called when a line M118 says that."""
         self.machine: Machine | None = None
-        super().__init__(
-            path, seed=seed, buses=buses, plant=PlantSettings(seed=seed, start=start, bed=self.bed)
-        )
+        plant = PlantSettings(seed=seed, start=start, bed=self.bed, heat=heat or HeatSettings())
+        super().__init__(path, seed=seed, buses=buses, plant=plant)
 
     def do(self, *lines: str, on_ready: Callable[[Machine], None] = lambda _: None) -> list[str]:
         """Run LINES as a program; return what it said."""
@@ -83,8 +102,19 @@ class ProbeStage(MachineStage):
             self.machine = machine
             on_ready(machine)
 
-        self.print_lines(lines, on_output=lambda told: self.output.append(told.text), on_ready=ready)
+        def hear(told: Any) -> None:
+            self.output.append(told.text)
+            self.on_echo.get(told.text.removeprefix("echo: "), lambda: None)()
+
+        self.print_lines(lines, on_output=hear, on_ready=ready)
         return self.output
+
+    def steps(self, step_pin: str, dir_pin: str, node: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return when a motor made its steps, s, and whether upwards."""
+        at = np.array([at for at, level in self.edges(step_pin, node) if level])
+        turns = [(-np.inf, 0), *self.edges(dir_pin, node)]
+        last = np.searchsorted([turn for turn, _ in turns], at, side="right") - 1
+        return at, np.array([level for _, level in turns], bool)[last]
 
     def fault(self, fault: PlantFault) -> None:
         """Let the probe fail."""

@@ -58,7 +58,9 @@ def read_endstop(reader: SectionReader, pins: PinRegistry) -> tuple[PinDescripti
 def _probe_pin(reader: SectionReader, pin: PinName, pins: PinRegistry) -> PinDescription | None:
     assert pins.probe is not None
     if pin.invert or pin.pull:
-        raise reader.bad(ENDSTOP_PIN, "which takes no marks: put them before the pin of [probe]")
+        raise reader.bad(
+            ENDSTOP_PIN, f"which takes no marks: put them before the pin of [{pins.probe.section}]"
+        )
     try:
         return pins.claim(pins.probe.pin, ENDSTOP_PIN, reader.section)
     except NotSupported:
@@ -83,18 +85,20 @@ def read_homing(reader: SectionReader, low: float, high: float, pins: PinRegistr
 def _read_probe_homing(
     reader: SectionReader, pin: PinDescription, low: float, high: float, pins: PinRegistry
 ) -> HomingDescription:
-    """Return how Z is homed by the probe: downwards, and its place follows from the z_offset of [probe]."""
+    """Return how Z is homed by the probe: downwards, and its place follows from the z_offset of the probe."""
     assert pins.probe is not None
     position = pins.probe.offset[2]
     if reader.has(POSITION_ENDSTOP):
-        raise reader.bad(POSITION_ENDSTOP, "but the z_offset of [probe] is where Z is; remove it")
+        raise reader.bad(
+            POSITION_ENDSTOP, f"but the z_offset of [{pins.probe.section}] is where Z is; remove it"
+        )
     if reader.find(POSITIVE_DIR):
         raise reader.bad(POSITIVE_DIR, "but a probe is lowered to the bed; remove it")
     if not low <= position <= high:
         raise reader.bad(
             ENDSTOP_PIN,
-            f"but the z_offset of [probe], {position:g} mm, is outside position_min and position_max"
-            f" ({low:g} to {high:g} mm); lower position_min",
+            f"but the z_offset of [{pins.probe.section}], {position:g} mm, is outside position_min"
+            f" and position_max ({low:g} to {high:g} mm); lower position_min",
         )
     return _homing(reader, (pin, PROBE_ENDSTOP), position, positive_dir=False)
 

@@ -1,9 +1,10 @@
-"""[probe] as the machine itself sees it: its input and where it is from the nozzle.
+"""The probe as the machine itself sees it: its input and where it is from the nozzle.
 
-``endstop_pin: probe:z_virtual_endstop`` makes the probe the endstop of Z: the pin is that of [probe], and Z
-is at ``z_offset`` when it triggers. All other options of the section belong to its module (modules/probes).
+``endstop_pin: probe:z_virtual_endstop`` makes the probe the endstop of Z: the pin is that of its section, and
+Z is at ``z_offset`` when it triggers. All other options of the section belong to its module (modules/probes).
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final, TypeVar
 
@@ -16,10 +17,14 @@ from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.sections.reading import Reading
 
-SECTION: Final = "probe"
+NAME: Final = "probe"
+"""Of the probe's own endstop, where it is not that of Z."""
 PIN: Final = PinOption(
     name="pin", help="input of the probe; high when triggered, with ! low", pullable=True, share="endstop"
 )
+SENSOR_PIN: Final = replace(PIN, name="sensor_pin")
+INPUTS: Final[Mapping[str, PinOption]] = {"probe": PIN, "bltouch": SENSOR_PIN, "smart_effector": PIN}
+"""The input of each kind of probe, by its section."""
 OFFSETS: Final = tuple(
     FloatOption(
         name=f"{axis}_offset",
@@ -42,12 +47,25 @@ T = TypeVar("T")
 
 
 def note_probe(config: ConfigFile, pins: PinRegistry) -> None:
-    """Have PINS know the input of [probe], if CONFIG has one; what is wrong there its module reports."""
-    section = config.sections.get(SECTION)
-    pin = None if section is None else _value(section, PIN)
+    """Have PINS know the input of the probe, if CONFIG has one; what is wrong there its module reports.
+
+    Raises ConfigError where there are two.
+    """
+    section = _section(config)
+    pin = None if section is None else _value(section, INPUTS[section.name])
     if section is not None and pin is not None:
         x, y, z = (_value(section, option) or 0.0 for option in (*OFFSETS, Z_OFFSET))
-        pins.probe = ProbeSwitch(pin, (x, y, z))
+        pins.probe = ProbeSwitch(pin, (x, y, z), section.name)
+
+
+def _section(config: ConfigFile) -> RawSection | None:
+    found = [section for name, section in config.sections.items() if name in INPUTS]
+    if len(found) > 1:
+        raise ConfigError(
+            found[1].place,
+            f"[{found[1].name}] and [{found[0].name}] are both probes; a machine has one: remove the other",
+        )
+    return found[0] if found else None
 
 
 def _value(section: RawSection, option: Option[T]) -> T | None:
@@ -63,17 +81,17 @@ def read_probe(reading: Reading, frame: Frame) -> ProbeDescription | None:
     for rail in frame.rails:
         if rail.homing.virtual_endstop == PROBE_ENDSTOP and rail.axis != "z":
             raise ConfigError(rail.place, f"{PROBE_ENDSTOP} is an endstop of Z; give {rail.axis} a switch")
-    found, section = reading.pins.probe, reading.config.sections.get(SECTION)
+    found, section = reading.pins.probe, _section(reading.config)
     rail_z = next((rail for rail in frame.rails if rail.axis == "z"), None)
     if found is None or section is None or not frame.rails:
         return None
     try:
-        pin = reading.pins.claim(found.pin, PIN, section)
+        pin = reading.pins.claim(found.pin, INPUTS[section.name], section)
     except NotSupported:
         return None  # its module is left out for the same reason
     if rail_z is not None and rail_z.homing.virtual_endstop == PROBE_ENDSTOP:
-        return ProbeDescription(rail_z, found.offset)
+        return ProbeDescription(rail_z, found.offset, section.name)
     motors = rail_z if rail_z is not None else frame.rails[0]
     homing = HomingDescription(pin, virtual_endstop=PROBE_ENDSTOP, position_endstop=found.offset[2])
-    rail = replace(motors, axis=SECTION, homing=homing, place=section.place, second_endstops=())
-    return ProbeDescription(rail, found.offset)
+    rail = replace(motors, axis=NAME, homing=homing, place=section.place, second_endstops=())
+    return ProbeDescription(rail, found.offset, section.name)

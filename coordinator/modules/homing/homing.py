@@ -9,6 +9,7 @@ level. A rail without an endstop on a pin is taken as home. What moves when is i
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
 from typing import Final
 
 from coordinator.config.errors import ConfigError
@@ -81,7 +82,7 @@ class Homing(Module):
     def link(self, modules: Modules) -> None:
         """Find the drivers for sensorless homing, and the probe that is the endstop of Z."""
         if self._by_probe:
-            self._probe = modules.find("probe", ProbeEndstop)
+            self._probe = next(modules.of(ProbeEndstop), None)
         for rail in (rail for approach in self._approaches for rail in approach.rails):
             virtual = rail.homing.virtual_endstop
             found = modules.find(section_of(virtual), StallEndstop) if virtual else None
@@ -275,10 +276,11 @@ class Homing(Module):
                 ways=approach.ways,
                 way_mm=way_mm,
                 speed=speed,
-                accel=self._accel(approach.axis, approach.rails[0]),
+                accel=self._approach_accel(approach),
             )
             try:
-                return await move.run()
+                async with self._touching(approach):
+                    return await move.run()
             except HomingError as error:
                 if not approach.rails[0].homing.by_probe:
                     raise
@@ -286,6 +288,11 @@ class Homing(Module):
                     f"Z was not homed: {in_words_of_the_probe(error)}; the head was lowered by"
                     f" {move.planned_way_mm:.3f} mm"
                 ) from error
+
+    def _touching(self, approach: Approach) -> AbstractAsyncContextManager[None]:
+        if self._probe is None or not approach.rails[0].homing.by_probe:
+            return contextlib.nullcontext()
+        return self._probe.touching(alone=True)
 
     def _feels(self, rail: "RailDescription") -> StallEndstop | None:
         return self._feelers.get(rail.homing.virtual_endstop)
@@ -298,6 +305,12 @@ class Homing(Module):
         rail = approach.rails[0]
         ramp = Ramp(way_mm, rail.homing.retract_speed, self._accel(approach.axis, rail))
         await SingleMove(self._machine, ramp, ways=ways).run()
+
+    def _approach_accel(self, approach: Approach) -> float:
+        accel = self._accel(approach.axis, approach.rails[0])
+        if self._probe is None or not approach.rails[0].homing.by_probe:
+            return accel
+        return min(accel, self._probe.probing_accel or accel)
 
     def _accel(self, axis: str, rail: "RailDescription") -> float:
         limits = self._described.limits

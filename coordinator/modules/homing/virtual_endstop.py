@@ -1,6 +1,6 @@
 """Endstops that are no switches: what a homing move has to do before and after it looks at one."""
 
-from contextlib import AbstractAsyncContextManager
+from contextlib import AbstractAsyncContextManager, nullcontext
 
 from coordinator.gcode.commands import Call, Lines
 from coordinator.modules.base import Module
@@ -19,6 +19,19 @@ class StallEndstop(Module):
 
 class ProbeEndstop(Module):
     """A module whose probe may be the endstop of Z."""
+
+    def touching(self, *, alone: bool) -> AbstractAsyncContextManager[None]:
+        """Return what makes it ready for one way down, from where the head stands, and puts it away after.
+
+        ALONE: no other way down of the same command follows. Raises CanductorError.
+        """
+        del alone
+        return nullcontext()
+
+    @property
+    def probing_accel(self) -> float | None:
+        """Acceleration of the way down at most, mm/s²; None: any."""
+        return None
 
     @property
     def has_lines(self) -> bool:

@@ -5,9 +5,9 @@ the probe triggers, the lines of ``deactivate_gcode``, a lift, and that again un
 Modules that level something ask for places by ``deploy``, ``measure`` and ``stow``.
 """
 
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import (
@@ -18,8 +18,9 @@ from coordinator.config.options import (
     IntOption,
     Option,
 )
+from coordinator.config.pins import PinOption
 from coordinator.config.sections.bounds import MAX_SPEED
-from coordinator.config.sections.probe import OFFSETS, Z_OFFSET
+from coordinator.config.sections.probe import OFFSETS, PIN, Z_OFFSET
 from coordinator.gcode.builtins.state import go
 from coordinator.gcode.commands import (
     AtStandstill,
@@ -40,7 +41,8 @@ from coordinator.modules.levelling.skew_correction import Skew, Skews
 from coordinator.modules.probes.samples import AVERAGE, MEDIAN, SampleRules, SampleSeries
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.runtime.moves.probing import Contact, ProbingMove, downwards
+from coordinator.runtime.moves.homing import HomingError
+from coordinator.runtime.moves.probing import Contact, ProbingMove, downwards, place_by_steps
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
@@ -98,6 +100,10 @@ PARAMETERS: Final = (
 SAME_MM: Final = 1e-6
 
 
+class NotReadyError(HomingError):
+    """A probe could not be deployed or put away."""
+
+
 @dataclass(frozen=True, slots=True)
 class Measuring:
     """How a command measures."""
@@ -121,7 +127,7 @@ class Measured:
 Phase = Generator[Reading, None, Measured | None]
 
 
-OPTIONS: Final[tuple[Option[Any], ...]] = (
+MEASURING_OPTIONS: Final[tuple[Option[Any], ...]] = (
     *OFFSETS,
     Z_OFFSET,
     SPEED,
@@ -132,18 +138,28 @@ OPTIONS: Final[tuple[Option[Any], ...]] = (
     TOLERANCE,
     RETRIES,
     DROP_FIRST,
-    ACTIVATE,
-    DEACTIVATE,
-    EACH,
 )
 """Of every probe."""
+LINE_OPTIONS: Final[tuple[Option[Any], ...]] = (ACTIVATE, DEACTIVATE, EACH)
+"""Of probes that are deployed by g-code."""
 
 
 class Probe(ProbeEndstop):
-    """The probe; PROBE and the like are in probe_commands.py, the kinds of probes in files of their own."""
+    """The probe; PROBE and the like are in probe_commands.py, the kinds of probes in files of their own.
+
+    A kind declares INPUT; one that has to be deployed or waited for overrides ``touching``, or with
+    ``stays_deployed`` also ``begin`` and ``finish``; all of them run at standstill.
+    """
+
+    SHOWN_AS = "probe"
+    INPUT: ClassVar[PinOption] = PIN
+    """Its input."""
+    HAS_LINES: ClassVar[bool] = True
+    """Whether it has the options of LINE_OPTIONS."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
+        build.pin(self.INPUT)
         x, y = (build.get(option) for option in OFFSETS)
         self.offset: Point = (x, y, build.get(Z_OFFSET))
         """From the nozzle: X, Y, and how high that is when the probe triggers, mm."""
@@ -160,9 +176,11 @@ class Probe(ProbeEndstop):
                 drop_first=build.get(DROP_FIRST),
             ),
         )
-        self._activate = GCodeTemplate(build, ACTIVATE)
-        self._deactivate = GCodeTemplate(build, DEACTIVATE)
-        self._each = build.get(EACH)
+        self._activate = GCodeTemplate(build, ACTIVATE) if self.HAS_LINES else None
+        self._deactivate = GCodeTemplate(build, DEACTIVATE) if self.HAS_LINES else None
+        self._each = not self.HAS_LINES or build.get(EACH)
+        self.corrections: list[Callable[[float, float], float]] = []
+        """What is added to a measured height, mm, by X and Y of the probe."""
         if downwards(build.machine) is None:
             raise ConfigError(
                 build.place,
@@ -202,15 +220,15 @@ class Probe(ProbeEndstop):
     @property
     def has_lines(self) -> bool:
         """Whether it is activated or deactivated by g-code."""
-        return bool(self._activate.text.strip() or self._deactivate.text.strip())
+        return any(lines is not None and lines.text.strip() for lines in (self._activate, self._deactivate))
 
     def lines_before(self, call: Call) -> Lines:
         """Return the lines that activate it."""
-        return self._activate.lines(call, {})
+        return Lines("") if self._activate is None else self._activate.lines(call, {})
 
     def lines_after(self, call: Call) -> Lines:
         """Return the lines that deactivate it."""
-        return self._deactivate.lines(call, {})
+        return Lines("") if self._deactivate is None else self._deactivate.lines(call, {})
 
     # ------------------------------------------------------------------------------------------ measuring
 
@@ -245,13 +263,36 @@ class Probe(ProbeEndstop):
         if "Z" not in call.homed:
             raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
 
+    async def is_triggered(self) -> bool:
+        """Return whether its node sees it triggered now; raises CanductorError."""
+        machine = self.live.machine
+        described = machine.description.probe
+        assert described is not None
+        node = self.live.node(machine.devices.endstop_node(described.rail))
+        return (await machine.devices.endstops[described.rail.axis].state(node)).pressed
+
+    @property
+    def stays_deployed(self) -> bool:
+        """Whether it stays deployed between the measurements of a command, from ``begin`` to ``finish``."""
+        return False
+
+    async def begin(self) -> None:
+        """Begin to measure the places of one command, at standstill."""
+
+    async def finish(self) -> None:
+        """End what ``begin`` began, at standstill; raises CanductorError."""
+
     def deploy(self, job: ProgramContext, command: Command) -> Iterator[Reading]:
         """Make ready for the places of COMMAND."""
         if not self._each:
             yield from self._run_lines(job, command, self._activate)
+        if self.stays_deployed:
+            yield AtStandstill(self.begin)
 
     def stow(self, job: ProgramContext, command: Command) -> Iterator[Reading]:
         """Put away what ``deploy`` made ready."""
+        if self.stays_deployed:
+            yield AtStandstill(self.finish)
         if not self._each:
             yield from self._run_lines(job, command, self._deactivate)
 
@@ -262,14 +303,16 @@ class Probe(ProbeEndstop):
             contact = yield from self.touch(job, command, how)
             if contact is None:
                 return None
-            found = self._found(contact, contact.trigger_z)
-            yield Immediate((f"probe at {found.bed[0]:.3f},{found.bed[1]:.3f} is z={contact.trigger_z:.6f}",))
-            if remark := series.take(contact.trigger_z):
+            height = contact.trigger_z + self._correction(contact)
+            found = self._found(contact, height)
+            yield Immediate((f"probe at {found.bed[0]:.3f},{found.bed[1]:.3f} is z={height:.6f}",))
+            if remark := series.take(height):
                 yield Immediate((remark,))
             if series.is_complete:
                 break
             yield from lift(job, contact.position[2] + how.retract_mm, how.lift_speed)
         if series.failed:
+            yield from self.stow(job, command)
             raise WordError(f"{command.name} failed: {series.failed}")
         return self._found(contact, series.result)
 
@@ -290,10 +333,14 @@ class Probe(ProbeEndstop):
                 lowest_z=self._lowest_z,
                 speed=how.speed,
                 corrected=self._skews is not None and self._skews.now != Skew(),
+                accel=self.probing_accel,
                 say=self._live.say,
             )
             try:
-                contact = await move.run()
+                async with self.touching(alone=False):
+                    contact = await move.run()
+            except NotReadyError as error:
+                raise CanductorError(f"{command.name} failed: {error}; {await self._place()}") from error
             except CanductorError as error:
                 if self._live.machine.stopped is not None:
                     raise
@@ -308,14 +355,24 @@ class Probe(ProbeEndstop):
             yield from self._run_lines(job, command, self._deactivate)
         return found[0]
 
+    async def _place(self) -> str:
+        place = await place_by_steps(self.live.machine)
+        return "Z is not known" if place is None else f"Z is {place[2]:.3f} mm"
+
+    def _correction(self, contact: Contact) -> float:
+        x, y, _ = contact.trigger
+        return sum(correction(x + self.offset[0], y + self.offset[1]) for correction in self.corrections)
+
     def _found(self, contact: Contact, height: float) -> Measured:
         x, y, _ = contact.trigger
         dx, dy, dz = self.offset
         return Measured((x, y, height), (x + dx, y + dy, height - dz))
 
-    def _run_lines(self, job: ProgramContext, command: Command, template: GCodeTemplate) -> Iterator[Reading]:
+    def _run_lines(
+        self, job: ProgramContext, command: Command, template: GCodeTemplate | None
+    ) -> Iterator[Reading]:
         """Run lines that must leave the head where it is."""
-        if not template.text.strip():
+        if template is None or not template.text.strip():
             return
         before = job.planner.toolhead_position[:3]
         yield template.lines(job.call(command), {})

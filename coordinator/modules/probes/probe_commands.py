@@ -57,7 +57,7 @@ class ProbeCommands(Module):
 
     def link(self, modules: Modules) -> None:
         """Find the probe."""
-        self._probe = modules.find("probe", Probe)
+        self._probe = next(modules.of(Probe), None)
 
     async def connect(self, live: ModuleContext) -> None:
         """Take over the machine."""
@@ -119,14 +119,8 @@ class ProbeCommands(Module):
         call.parameters()
 
         async def query() -> Done:
-            described = self._machine.probe
-            assert self._live is not None
-            assert described is not None
-            devices = self._live.machine.devices
-            node = self._live.node(devices.endstop_node(described.rail))
-            state = await devices.endstops[described.rail.axis].state(node)
-            self.probe.last_query = state.pressed
-            return Done((f"probe: {'TRIGGERED' if state.pressed else 'open'}",))
+            self.probe.last_query = await self.probe.is_triggered()
+            return Done((f"probe: {'TRIGGERED' if self.probe.last_query else 'open'}",))
 
         return AtStandstill(query)
 

@@ -3,7 +3,7 @@
 from coordinator.config.options import SectionSpec
 from coordinator.config.sections.probe import PIN
 from coordinator.modules.base import Build
-from coordinator.modules.probes.probe import OPTIONS, Probe
+from coordinator.modules.probes.probe import LINE_OPTIONS, MEASURING_OPTIONS, Probe
 from coordinator.modules.probes.probe_commands import ProbeCommands
 
 
@@ -13,10 +13,9 @@ class SwitchProbe(Probe):
     KIND = "probe"
     SPEC = SectionSpec(
         "A switch at the head that finds how high the bed is; by probe:z_virtual_endstop the endstop of Z",
-        (PIN, *OPTIONS),
+        (PIN, *MEASURING_OPTIONS, *LINE_OPTIONS),
     )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        build.pin(PIN)
         build.shared(ProbeCommands)

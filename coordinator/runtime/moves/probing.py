@@ -59,7 +59,8 @@ class ProbingMove:
     """Lowers the head of MACHINE from POSITION (X Y Z E, by the program) until the probe triggers.
 
     It goes no lower than LOWEST_Z (mm); SPEED in mm/s. CORRECTED: the program's X Y Z are not those of the
-    motors, so that POSITION counts and not the motors' own. SAY shows a sentence to the user.
+    motors, so that POSITION counts and not the motors' own. ACCEL: of the move at most, mm/s²; None: that of
+    the machine. SAY shows a sentence to the user.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class ProbingMove:
         lowest_z: float,
         speed: float,
         corrected: bool,
+        accel: float | None = None,
         say: Callable[[str], None],
     ) -> None:
         probe = machine.description.probe
@@ -82,7 +84,8 @@ class ProbingMove:
         self._say = say
         limits = machine.description.limits
         self._speed = min(speed, limits.max_z_velocity)
-        self._accel = min(limits.max_accel, limits.max_z_accel)
+        most = min(limits.max_accel, limits.max_z_accel)
+        self._accel = min(most, accel or most)
 
     async def run(self) -> Contact:
         """Move; raises CanductorError, with all stopped, saying which Z was reached."""

@@ -252,7 +252,7 @@ def test_the_end_says_what_will_not_act_and_what_that_means(tmp_path: Path) -> N
     probed = GOOD.replace(
         "rotation_distance: 8\n", "rotation_distance: 8\nendstop_pin: probe:z_virtual_endstop\n"
     )
-    path.write_text(f"{probed}[bltouch]\nsensor_pin: PA9\nz_offset: 1\n[neopixel a]\npin: PA8\n")
+    path.write_text(f"{probed}[dockable_probe]\npin: PA9\nz_offset: 1\n[neopixel a]\npin: PA8\n")
     report = check(str(path))
     assert report.ok
     head, _, listed = report.to_text().partition("What will not act, and what that means for a print:\n")
@@ -264,7 +264,7 @@ def test_the_end_says_what_will_not_act_and_what_that_means(tmp_path: Path) -> N
     probed = "nothing is probed; an axis that it homes is refused by G28, lines that probe end a job"
     assert lines == [
         f"21: {homed} by G28",
-        f"29: [bltouch]: not supported yet, ignored: {probed}",
+        f"29: [dockable_probe]: not supported yet, ignored: {probed}",
         "32: [neopixel a]: not supported yet, ignored: no light; a print is as it would be",
     ]
     means = {entry["section"]: entry["meaning"] for entry in report.to_json()["unsupported"]}

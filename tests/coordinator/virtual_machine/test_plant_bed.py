@@ -60,6 +60,13 @@ def test_a_probe_may_fail(fault: PlantFault, seen: bool) -> None:
     assert pressed(Bed(), 0, 0, -5.0 if fault is PlantFault.NEVER else 50.0, fault) is seen
 
 
+def test_a_probe_may_close_late() -> None:
+    at = OFFSET[2]
+    assert not pressed(Bed(), 0, 0, at - 0.19, PlantFault.LATE)
+    assert pressed(Bed(), 0, 0, at - 0.21, PlantFault.LATE)
+    assert not pressed(Bed(), 0, 0, at - 5, PlantFault.STUCK), "it was open"
+
+
 def test_a_bed_that_is_not_there_is_refused() -> None:
     probe = Probe(name="probe", pin="PC5", bed="nothing", x="x", y="x", z="x")
     with pytest.raises(CanductorError, match="bed=nothing: expected a bed described above"):

@@ -299,7 +299,7 @@ def test_the_second_side_is_brought_level_with_the_first(
 def test_axes_that_cannot_be_homed_are_refused_before_anything_moves(stager: Stager) -> None:
     text = changed("endstop_pin: PC7\n", "endstop_pin: probe:z_virtual_endstop\n", SWITCHES_CFG)
     stage = stager(
-        changed("position_endstop: -0.5\n", "", text) + "[bltouch]\nsensor_pin: PA9\nz_offset: 1\n"
+        changed("position_endstop: -0.5\n", "", text) + "[dockable_probe]\npin: PA9\nz_offset: 1\n"
     )
     refused = r"^G28 of Z is refused: the endstop probe:z_virtual_endstop \(.*\) is not supported yet; give"
     with pytest.raises(CanductorError, match=refused):

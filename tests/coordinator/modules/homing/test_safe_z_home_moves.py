@@ -177,7 +177,7 @@ def test_z_is_refused_at_a_place_outside_and_other_axes_are_not(
 
 def test_what_cannot_be_homed_is_refused_before_the_head_is_lifted(stager: Stager) -> None:
     text = changed("endstop_pin: PC7\n", "endstop_pin: probe:z_virtual_endstop\n", SWITCHES_CFG)
-    text = changed("position_endstop: -0.5\n", "", text) + "[bltouch]\nsensor_pin: PA9\nz_offset: 1\n"
+    text = changed("position_endstop: -0.5\n", "", text) + "[dockable_probe]\npin: PA9\nz_offset: 1\n"
     stage = stager(SAFE + HOP, text)
     with pytest.raises(CanductorError, match="G28 of Z is refused: the endstop probe:z_virtual_endstop"):
         home(stage, "XYZ")

@@ -389,8 +389,8 @@ points:
     50, 225
 [neopixel light]
 pin: PA8
-[bltouch]
-sensor_pin: PA9
+[dockable_probe]
+pin: PA9
 [fan_generic mine]
 pin: sx1509_a:PIN_1
 [sx1509 a]
