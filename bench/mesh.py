@@ -4,7 +4,7 @@
 
 The same file is planned on the demo's machine with a mesh of 7 by 7 points loaded, with none, and a file that
 only loads it, in turn, RUNS times in one process: a computer that gets slower does so for all of them. A
-figure is the median of user CPU seconds; what the short file costs (the configuration is read) is taken off. A
+figure is the median of user CPU seconds, without what the short file costs (the configuration is read). A
 cost is the median of the costs of pairs.
 """
 
@@ -47,7 +47,8 @@ def machine_text(*, shaped: bool) -> str:
         + f"probe_count: {POINTS}\nalgorithm: bicubic\n"
         + "[bed_mesh bench]\nversion: 1\npoints:\n"
         + "\n".join(rows)
-        + f"\nx_count: {POINTS}\ny_count: {POINTS}\nmesh_x_pps: 2\nmesh_y_pps: 2\nalgo: bicubic\ntension: 0.2\n"
+        + f"\nx_count: {POINTS}\ny_count: {POINTS}\nmesh_x_pps: 2\nmesh_y_pps: 2\n"
+        + "algo: bicubic\ntension: 0.2\n"
         + edges
         + (SHAPERS if shaped else "")
     )
@@ -93,7 +94,9 @@ def one_machine(folder: Path, text: str, runs: int, *, shaped: bool) -> None:
     costs = sorted(bent / plain - 1 for plain, bent in rows)
     plain, bent = (statistics.median(column) for column in zip(*rows, strict=True))
     said = ", ".join(f"{cost:.1%}" for cost in costs)
-    print(f"{'mzv' if shaped else 'none':8} {plain:8.2f} {bent:9.2f} {statistics.median(costs):7.1%}   {said}")
+    print(
+        f"{'mzv' if shaped else 'none':8} {plain:8.2f} {bent:9.2f} {statistics.median(costs):7.1%}   {said}"
+    )
 
 
 if __name__ == "__main__":
