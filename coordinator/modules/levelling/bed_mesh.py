@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.config.errors import NotSupported
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.builtins.machine import come_to_standstill
 from coordinator.gcode.commands import (
@@ -20,7 +19,7 @@ from coordinator.gcode.commands import (
 )
 from coordinator.gcode.events import PositionSet, Reply, SurfaceChange
 from coordinator.gcode.parameters import bounded, flag, one, value
-from coordinator.gcode.parser import WordError, quoted
+from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.levelling.bed_mesh_options import (
     BY_PROBE,
@@ -37,8 +36,8 @@ from coordinator.modules.levelling.bed_mesh_options import (
     read_settings,
 )
 from coordinator.modules.levelling.mesh import Grid, Mesh, Place, adapted, fitting_algorithm
-from coordinator.modules.levelling.points import ProbePoints
-from coordinator.modules.probes.probe import Measuring, Probe
+from coordinator.modules.levelling.points import ProbePoints, how_to_measure
+from coordinator.modules.probes.probe import Measured, Measuring, Probe
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
@@ -88,7 +87,6 @@ class BedMesh(Module):
         self.profiles: dict[str, Mesh] = {}
         self._settings: MeshSettings | None = None
         self._points: ProbePoints | None = None
-        self._place = build.place
         self._limits = build.machine.limits
         self._mesh: Mesh | None = None
         self._fine: list[Value] = [[]]
@@ -113,11 +111,9 @@ class BedMesh(Module):
         self._settings, self._points = settings, points
 
     def link(self, modules: Modules) -> None:
-        """Find the probe; raises ConfigError."""
+        """Find the probe, without which the bed is probed by hand."""
         self._probe = next((modules.find(name, Probe) for name in modules.names(Probe)), None)
         self._objects = modules.find("exclude_object", ExcludeObject)
-        if self._settings is not None and self._probe is None:
-            raise NotSupported(self._place, "it needs a probe that acts: [probe]")
 
     def status(self) -> Mapping[str, Value]:
         """Report the mesh that is followed, and all profiles, as front ends draw them."""
@@ -171,12 +167,10 @@ class BedMesh(Module):
     def _read_calibrate(self, call: Call) -> Reading:
         if self._settings is None:
             raise WordError("BED_MESH_CALIBRATE needs the section [bed_mesh], which says where to probe")
-        assert self._probe is not None
+        assert self._points is not None
         command = call.command
-        how = self._probe.how(command)
+        how = how_to_measure(call, self._probe)
         given = command.only_parameters(PARAMETERS)
-        if given.get("METHOD", "automatic").lower() not in ("automatic", "scan", "rapid_scan"):
-            raise WordError(f"METHOD of {command.name} is {quoted(given['METHOD'])}; automatic is possible")
         grid = grid_for(command, given, self._settings.grid)
         if flag(command, given, "ADAPTIVE"):
             margin = bounded(command, given, "ADAPTIVE_MARGIN", self._settings.margin, low=0, high=1000)
@@ -187,25 +181,32 @@ class BedMesh(Module):
         except ValueError as error:
             raise WordError(f"{command.name}: {error}") from None
         profile = profile_name(command, given, "PROFILE") if "PROFILE" in given else DEFAULT_PROFILE
-        self._probe.check(call)
+        by = None if how is None or self._probe is None else (self._probe, how)
+        self._points.check(call, None if by is None else by[0])
         wanted_mesh = _Wanted(grid, algorithm, profile)
-        return Phases(lambda job: self._calibrate(job, call, how, wanted_mesh))
+        return Phases(lambda job: self._calibrate(job, call, by, wanted_mesh))
 
     def _calibrate(
-        self, job: ProgramContext, call: Call, how: Measuring, wanted: "_Wanted"
+        self, job: ProgramContext, call: Call, by: tuple[Probe, Measuring] | None, wanted: "_Wanted"
     ) -> Iterator[Reading]:
-        grid, profile = wanted.grid, wanted.profile
         assert self._settings is not None
         assert self._points is not None
-        assert self._probe is not None
         yield ProgramAction(lambda job: self.take(job, None))
-        places, zero = grid.places(), self._settings.zero
+        places, zero = wanted.grid.places(), self._settings.zero
         if zero is not None and zero not in places:
             places.append(zero)
-        measured = yield from self._points.measure(job, call.command, self._probe, how, places=places)
-        if measured is None:
-            return
-        height = {place: found.bed[2] for place, found in zip(places, measured, strict=True)}
+
+        def found(job: ProgramContext, measured: list[Measured]) -> Iterator[Reading]:
+            del job
+            height = {place: one.bed[2] for place, one in zip(places, measured, strict=True)}
+            yield from self._measured(call, wanted, height)
+
+        yield from self._points.collect(job, call, by, found, places=places)
+
+    def _measured(self, call: Call, wanted: "_Wanted", height: Mapping[Place, float]) -> Iterator[Reading]:
+        """Make a mesh of the bed's HEIGHT at the places of a grid, and follow it."""
+        assert self._settings is not None
+        grid, profile, zero = wanted.grid, wanted.profile, self._settings.zero
         try:
             heights = grid.heights(height.__getitem__)
         except ValueError as error:

@@ -4,13 +4,14 @@ TESTZ also halves: between the height at hand and the next one that was tried ab
 """
 
 from bisect import insort
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final, Protocol
 
 from coordinator.gcode.builtins.state import go
-from coordinator.gcode.commands import AtStandstill, Call, ProgramAction, ProgramContext, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Phases, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.events import Done, Reply
 from coordinator.gcode.parser import Command, WordError, number, quoted
+from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module
 from coordinator.support.values import Value
 
@@ -19,6 +20,8 @@ SPEED: Final = 5.0
 HALVED_MM: Final = 0.5
 """``+`` and ``-`` where nothing was tried yet on that side, halved."""
 SAME_MM: Final = 1e-6
+Then = Callable[[ProgramContext, Point], Iterator[Reading]]
+"""What follows when the nozzle is at the place that was found, mm."""
 _BEGUN: Final = "now move with TESTZ Z=-0.1 (+, -, ++, --) until it fits; end with ACCEPT or ABORT"
 
 
@@ -45,6 +48,8 @@ class ManualProbe(Module):
         self._machine = build.machine
         self._accepted: Callable[[float], tuple[str, ...]] | None = None
         """What a height that is accepted leads to; None: nothing is looked for."""
+        self._then: Then | None = None
+        """What follows a height that is accepted, where others are looked for after it."""
         self.other: TakesAnswers | None = None
         """Another search, such as that for the turns of screws."""
         self._speed = SPEED
@@ -132,10 +137,22 @@ class ManualProbe(Module):
 
         TESTZ goes at SPEED, mm/s. Raises WordError.
         """
+        return self._begin(call, accepted, None, speed)
+
+    def follow(self, call: Call, then: Then, speed: float = SPEED) -> Reading:
+        """Return what begins to look for a height, which THEN goes on from; raises WordError.
+
+        TESTZ goes at SPEED, mm/s.
+        """
+        return self._begin(call, lambda _: (), then, speed)
+
+    def _begin(
+        self, call: Call, accepted: Callable[[float], tuple[str, ...]], then: Then | None, speed: float
+    ) -> Reading:
         self.check_free(call)
 
         def act(job: ProgramContext) -> bool:
-            self._accepted, self._speed, self._tried = accepted, speed, []
+            self._accepted, self._then, self._speed, self._tried = accepted, then, speed, []
             job.emit(Reply(job.line, _BEGUN))
             self._tell(job)
             return True
@@ -194,12 +211,19 @@ class ManualProbe(Module):
         if self.other is not None and self.other.is_active:
             return self.other.read_accept(call)
         accepted = self._check_active(call)
+        if (then := self._then) is not None:
+            return Phases(lambda job: self._go_on(job, then))
 
         async def accept() -> Done:
             self._accepted = None
             return Done(accepted(call.position[2]))
 
         return AtStandstill(accept)
+
+    def _go_on(self, job: ProgramContext, then: Then) -> Iterator[Reading]:
+        x, y, z, _ = job.planner.toolhead_position
+        self._accepted = self._then = None
+        yield from then(job, (x, y, z))
 
     def _read_abort(self, call: Call) -> Reading:
         call.parameters()
@@ -208,7 +232,7 @@ class ManualProbe(Module):
         self._check_active(call)
 
         async def abort() -> Done:
-            self._accepted = None
+            self._accepted = self._then = None
             return Done((f"nothing is kept; Z stays at {call.position[2]:.3f}",))
 
         return AtStandstill(abort)
