@@ -111,8 +111,9 @@ class BedMesh(Module):
         self._settings, self._points = settings, points
 
     def link(self, modules: Modules) -> None:
-        """Find the probe, without which the bed is probed by hand."""
-        self._probe = next((modules.find(name, Probe) for name in modules.names(Probe)), None)
+        """Find the probe, without which the bed is probed by hand; raises NotSupported."""
+        if self._points is not None:
+            self._probe = self._points.find_probe(modules)
         self._objects = modules.find("exclude_object", ExcludeObject)
 
     def status(self) -> Mapping[str, Value]:

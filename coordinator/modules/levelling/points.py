@@ -4,6 +4,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from coordinator.config.errors import NotSupported
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option
 from coordinator.config.sections.bounds import MAX_POSITION, MAX_SPEED
 from coordinator.gcode.builtins.state import go
@@ -11,7 +12,7 @@ from coordinator.gcode.commands import Call, Immediate, ProgramAction, ProgramCo
 from coordinator.gcode.parameters import bounded
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.kinematics.base import Point
-from coordinator.modules.base import Build
+from coordinator.modules.base import Build, Modules
 from coordinator.modules.levelling.surfaces import Place
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.probes.probe import Measured, Measuring, Probe, lift
@@ -80,6 +81,11 @@ OPTIONS: Final[tuple[Option[Any], ...]] = (TRAVEL_SPEED, HEIGHT, BY_PROBE)
 
 Found = Callable[[ProgramContext, list[Measured]], Iterator[Reading]]
 """What follows when all places are measured."""
+PROBES: Final = (
+    *("probe", "bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe", "dockable_probe"),
+    *("cartographer", "beacon", "scanner"),
+)
+"""First words of sections of probes, of which some may not act yet."""
 AUTOMATIC: Final = ("automatic", "scan", "rapid_scan")
 MANUAL: Final = "manual"
 
@@ -109,8 +115,20 @@ class ProbePoints:
     ) -> None:
         self.places = tuple(places)
         self._manual = build.shared(ManualProbe)
+        self._place = build.place
+        self._left_out = [name for name in build.unsupported if name.partition(" ")[0] in PROBES]
         self._speed, self._height = build.get(TRAVEL_SPEED), build.get(HEIGHT)
         self._by_probe = build.get(by_probe)
+
+    def find_probe(self, modules: Modules) -> Probe | None:
+        """Return the probe, None where there is none; raises NotSupported for one that does not act yet.
+
+        A program that measures by such a probe must not wait for someone to measure by hand.
+        """
+        found = next((modules.find(name, Probe) for name in modules.names(Probe)), None)
+        if found is None and self._left_out:
+            raise NotSupported(self._place, f"it needs [{self._left_out[0]}], which is not supported yet")
+        return found
 
     def height(self, command: Command) -> float:
         """Return how high the head travels by COMMAND, or as configured; raises WordError."""

@@ -42,8 +42,8 @@ class ScrewsTiltAdjust(Module):
         build.add_command("SCREWS_TILT_CALCULATE", "Report how far each screw has to be turned", self._read)
 
     def link(self, modules: Modules) -> None:
-        """Find the probe, without which the bed is probed by hand."""
-        self._probe = next((modules.find(name, Probe) for name in modules.names(Probe)), None)
+        """Find the probe, without which the bed is probed by hand; raises NotSupported."""
+        self._probe = self._points.find_probe(modules)
 
     def status(self) -> Mapping[str, Value]:
         """Report what was found last."""
