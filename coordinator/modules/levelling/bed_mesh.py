@@ -1,9 +1,9 @@
 """[bed_mesh]: the bed is probed at many points, and Z follows its shape."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -39,11 +39,13 @@ from coordinator.modules.levelling.mesh import Grid, Mesh, Place, adapted, fitti
 from coordinator.modules.levelling.points import ProbePoints, how_to_measure
 from coordinator.modules.probes.probe import Measured, Measuring, Probe
 from coordinator.modules.programs.exclude_object import ExcludeObject
+from coordinator.motion.steps.surface import Surface
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 DEFAULT_PROFILE: Final = "default"
+RESTORE: Final = "_BED_MESH_RESTORE"
 
 
 class BedMeshSection(Module):
@@ -89,10 +91,13 @@ class BedMesh(Module):
         self._points: ProbePoints | None = None
         self._limits = build.machine.limits
         self._mesh: Mesh | None = None
+        self._surface: Surface | None = None
         self._fine: list[Value] = [[]]
         self._profile = ""
         self._offset: Place = (0.0, 0.0)
         self._fade_offset = 0.0
+        self.to_restore: Mapping[str, Any] | None = None
+        """What ``held`` returned before a crash."""
         self._probe: Probe | None = None
         self._objects: ExcludeObject | None = None
         for name, help_, read in (
@@ -102,6 +107,7 @@ class BedMesh(Module):
             ("BED_MESH_OFFSET", "Look the mesh up X and Y further, its fade ZFADE higher", self._read_offset),
             ("BED_MESH_OUTPUT", "Report the mesh, or with PGP=1 where it is probed", self._read_output),
             ("BED_MESH_MAP", "Report the probed heights as JSON", self._read_map),
+            (RESTORE, "Let Z follow the mesh that was followed before a crash", self._read_restore),
             ("BED_MESH_CHECK", "Fail if the mesh exceeds MAX_DEVIATION or MAX_SLOPE", self._read_check),
         ):
             build.add_command(name, help_, read)
@@ -149,7 +155,7 @@ class BedMesh(Module):
         at_s = planner.print_time_end_s
         job.emit(SurfaceChange(job.line, surface, at_s))
         job.emit(PositionSet(job.line, "", position, at_s))
-        self._mesh, self._profile = mesh, profile
+        self._mesh, self._profile, self._surface = mesh, profile, surface
         self._fine = [[]] if mesh is None else _rows(mesh.fine_heights())
         if surface is not None:
             fastest = self._limits.max_z_velocity / max(surface.steepest, 1e-9)
@@ -162,6 +168,53 @@ class BedMesh(Module):
                     )
                 )
         return True
+
+    # ------------------------------------------------------------------------------------ after a crash
+
+    def held(self) -> Mapping[str, Any] | None:
+        """Return what RESTORE needs, for a journal; None: no mesh is followed."""
+        mesh = self._mesh
+        return mesh and {
+            "profile": self._profile,
+            "heights": _rows(mesh.heights),
+            "minimum": mesh.minimum,
+            "maximum": mesh.maximum,
+            "algorithm": mesh.algorithm,
+            "tension": mesh.tension,
+            "pps": mesh.pps,
+            "offset": self._offset,
+            "z_fade": self._fade_offset,
+        }
+
+    def added_mm(self, place: tuple[float, float, float]) -> float:
+        """Return how much higher the motors are at a planned PLACE because of the mesh."""
+        if self._surface is None:
+            return 0.0
+        return self._surface.motor_z(*place) - place[2]
+
+    def _read_restore(self, call: Call) -> Reading:
+        call.parameters()
+        held = self.to_restore
+        if held is None or self._settings is None:
+            raise WordError("no mesh was followed before a crash")
+        try:
+            mesh = Mesh(
+                np.array(held["heights"], dtype=np.float64),
+                _pair(held["minimum"]),
+                _pair(held["maximum"]),
+                str(held["algorithm"]),
+                float(held["tension"]),
+                (int(held["pps"][0]), int(held["pps"][1])),
+            )
+            offset, fade_offset, profile = _pair(held["offset"]), float(held["z_fade"]), str(held["profile"])
+        except (KeyError, IndexError, TypeError, ValueError):
+            raise WordError("the mesh that was followed cannot be read") from None
+
+        def act(job: ProgramContext) -> bool:
+            self._offset, self._fade_offset = offset, fade_offset
+            return self.take(job, mesh, profile)
+
+        return ProgramAction(act)
 
     # ----------------------------------------------------------------------------------------- calibrating
 
@@ -318,6 +371,11 @@ class BedMesh(Module):
 def _save(live: ModuleContext, name: str, mesh: Mesh) -> None:
     for option, text in profile_texts(mesh).items():
         live.save(f"bed_mesh {name}", option, text)
+
+
+def _pair(numbers: Sequence[Any]) -> Place:
+    x, y = numbers
+    return float(x), float(y)
 
 
 def _rows(heights: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[Value]:
