@@ -19,7 +19,7 @@ from coordinator.gcode.commands import (
 )
 from coordinator.gcode.events import PositionSet, Reply, SurfaceChange
 from coordinator.gcode.parameters import bounded, flag, one, value
-from coordinator.gcode.parser import WordError
+from coordinator.gcode.parser import Command, WordError
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.levelling.bed_mesh_options import (
     BY_PROBE,
@@ -169,12 +169,63 @@ class BedMesh(Module):
                 )
         return True
 
+    def dump(self, parameters: Mapping[str, object]) -> Mapping[str, Value]:
+        """Return the mesh, all profiles, and where BED_MESH_CALIBRATE would probe; raises WordError.
+
+        PARAMETERS are those of that command, by name.
+        """
+        mesh, found = self._mesh, self.status()
+        current: dict[str, Value] = {}
+        if mesh is not None:
+            current = {
+                "name": self._profile,
+                "probed_matrix": found["probed_matrix"],
+                "mesh_matrix": found["mesh_matrix"],
+                "mesh_params": _parameters(mesh),
+            }
+        offset = (0.0, 0.0, 0.0) if self._probe is None else self._probe.offset
+        return {
+            "current_mesh": current,
+            "profiles": found["profiles"],
+            "calibration": self._planned(parameters),
+            "probe_offsets": [*offset],
+            "axis_minimum": [*self._limits.position_min, 0.0],
+            "axis_maximum": [*self._limits.position_max, 0.0],
+        }
+
+    def _planned(self, parameters: Mapping[str, object]) -> dict[str, Value]:
+        """Return where BED_MESH_CALIBRATE with PARAMETERS would probe."""
+        if self._settings is None:
+            return {}
+        each = ((name.upper(), str(value).replace('"', "")) for name, value in parameters.items())
+        text = " ".join(f'{name}="{value}"' for name, value in each)
+        command = Command("BED_MESH_CALIBRATE", text)
+        grid, algorithm = self._wanted(command)
+        path: list[Value] = [[x, y] for x, y in grid.places()]
+        settings = self._settings
+        config: dict[str, Value] = {
+            "x_count": grid.counts[0],
+            "y_count": grid.counts[1],
+            "mesh_x_pps": settings.pps[0],
+            "mesh_y_pps": settings.pps[1],
+            "algo": algorithm,
+            "tension": settings.tension,
+            "min_x": grid.minimum[0],
+            "max_x": grid.maximum[0],
+            "min_y": grid.minimum[1],
+            "max_y": grid.maximum[1],
+        }
+        rapid: list[Value] = [[place, True] for place in path]
+        return {"points": path, "config": config, "probe_path": path, "rapid_path": rapid}
+
     # ------------------------------------------------------------------------------------ after a crash
 
     def held(self) -> Mapping[str, Any] | None:
         """Return what RESTORE needs, for a journal; None: no mesh is followed."""
         mesh = self._mesh
-        return mesh and {
+        if mesh is None:
+            return None
+        return {
             "profile": self._profile,
             "heights": _rows(mesh.heights),
             "minimum": mesh.minimum,
@@ -225,20 +276,26 @@ class BedMesh(Module):
         command = call.command
         how = how_to_measure(call, self._probe)
         given = command.only_parameters(PARAMETERS)
+        grid, algorithm = self._wanted(command)
+        profile = profile_name(command, given, "PROFILE") if "PROFILE" in given else DEFAULT_PROFILE
+        by = None if how is None or self._probe is None else (self._probe, how)
+        self._points.check(call, None if by is None else by[0])
+        wanted_mesh = _Wanted(grid, algorithm, profile)
+        return Phases(lambda job: self._calibrate(job, call, by, wanted_mesh))
+
+    def _wanted(self, command: Command) -> tuple[Grid, str]:
+        """Return what COMMAND is to measure, and how its points are joined; raises WordError."""
+        assert self._settings is not None
+        given = command.only_parameters(PARAMETERS)
         grid = grid_for(command, given, self._settings.grid)
         if flag(command, given, "ADAPTIVE"):
             margin = bounded(command, given, "ADAPTIVE_MARGIN", self._settings.margin, low=0, high=1000)
             grid = adapted(grid, self._outlines(), margin)
         try:
             wanted = given.get("ALGORITHM", self._settings.algorithm).lower()
-            algorithm = fitting_algorithm(wanted, grid.counts)
+            return grid, fitting_algorithm(wanted, grid.counts)
         except ValueError as error:
             raise WordError(f"{command.name}: {error}") from None
-        profile = profile_name(command, given, "PROFILE") if "PROFILE" in given else DEFAULT_PROFILE
-        by = None if how is None or self._probe is None else (self._probe, how)
-        self._points.check(call, None if by is None else by[0])
-        wanted_mesh = _Wanted(grid, algorithm, profile)
-        return Phases(lambda job: self._calibrate(job, call, by, wanted_mesh))
 
     def _calibrate(
         self, job: ProgramContext, call: Call, by: tuple[Probe, Measuring] | None, wanted: "_Wanted"
@@ -385,18 +442,22 @@ def _rows(heights: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[Va
 def _told(mesh: Mesh) -> dict[str, Value]:
     return {
         "points": _rows(mesh.heights),
-        "mesh_params": {
-            "min_x": mesh.minimum[0],
-            "max_x": mesh.maximum[0],
-            "min_y": mesh.minimum[1],
-            "max_y": mesh.maximum[1],
-            "x_count": mesh.counts[0],
-            "y_count": mesh.counts[1],
-            "mesh_x_pps": mesh.pps[0],
-            "mesh_y_pps": mesh.pps[1],
-            "algo": mesh.algorithm,
-            "tension": mesh.tension,
-        },
+        "mesh_params": _parameters(mesh),
+    }
+
+
+def _parameters(mesh: Mesh) -> dict[str, Value]:
+    return {
+        "min_x": mesh.minimum[0],
+        "max_x": mesh.maximum[0],
+        "min_y": mesh.minimum[1],
+        "max_y": mesh.maximum[1],
+        "x_count": mesh.counts[0],
+        "y_count": mesh.counts[1],
+        "mesh_x_pps": mesh.pps[0],
+        "mesh_y_pps": mesh.pps[1],
+        "algo": mesh.algorithm,
+        "tension": mesh.tension,
     }
 
 
