@@ -42,7 +42,7 @@ BEDS = st.builds(
 SHAPERS = st.sampled_from((None, "zv", "mzv", "ei", "3hump_ei"))
 
 
-@settings(max_examples=examples(12))
+@settings(max_examples=examples(8))
 @given(some=BEDS, kind=st.sampled_from(("z", "z", "z", *WITH_Z)), shaper=SHAPERS, lift=st.booleans())
 def test_every_step_over_any_bed(some: SomeBed, kind: str, shaper: str | None, *, lift: bool) -> None:
     """Also over nearly flat ones, where whole moves are passed without a look at each of their phases."""
