@@ -11,7 +11,7 @@ def _words(text: str) -> tuple[str, ...]:
 
 UNSUPPORTED_SECTIONS = frozenset(
     (
-        *_words("manual_stepper delta_calibrate"),
+        *_words("manual_stepper"),
         *_words("homing_heaters temperature_probe adc_scaled ads1x1x ads1118"),
         *_words("probe_eddy_current load_cell"),
         *_words("load_cell_probe"),

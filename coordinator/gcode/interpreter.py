@@ -304,9 +304,9 @@ class Job(ProgramContext):
 
     def _act_noting(self, command: Command) -> bool:
         """Act on COMMAND, and report parameters that were ignored."""
-        ignored: list[str] = []
-        done = self._act(replace(command, ignored=ignored))
-        for key in ignored:
+        taken: dict[str, bool] = {}
+        done = self._act(replace(command, taken=taken))
+        for key in (key for key, any_took in taken.items() if not any_took):
             self.notice(
                 f"{quoted(key).strip(QUOTE)} of {command.name}", "it has no meaning here and is ignored"
             )

@@ -30,12 +30,12 @@ class Command:
     text: str
     written: str = ""
     """In capitals as it stands in the line, where that is not NAME: ``G00``, ``M104.0``."""
-    ignored: list[str] | None = None
-    """Collects the parameters that the reader ignored, for a notice; None: they are not reported."""
+    taken: dict[str, bool] | None = None
+    """Collects whether any reader took a parameter, for a notice of others; None: they are not reported."""
 
     def called(self, name: str) -> "Command":
         """Return the same command under another NAME."""
-        return Command(name, self.text, ignored=self.ignored)
+        return Command(name, self.text, taken=self.taken)
 
     def only_words(self, known: str) -> dict[str, str]:
         """Read the parameters as letters with numbers; what is none of KNOWN is ignored."""
@@ -46,8 +46,9 @@ class Command:
         return self._only(self.parameters(), tuple(known))
 
     def _only(self, found: dict[str, str], known: Container[str]) -> dict[str, str]:
-        if self.ignored is not None:
-            self.ignored.extend(key for key in found if key not in known)
+        if self.taken is not None:
+            for key in found:
+                self.taken[key] = self.taken.get(key, False) or key in known
         return {key: text for key, text in found.items() if key in known}
 
     def words(self) -> dict[str, str]:

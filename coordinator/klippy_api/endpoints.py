@@ -17,6 +17,7 @@ from coordinator.klippy_api.status import StatusBuilder, state_of
 from coordinator.klippy_api.subscription import Subscription, select_fields
 from coordinator.klippy_api.wire import Request
 from coordinator.modules.homing.homing import Homing
+from coordinator.modules.levelling.bed_mesh import BedMesh
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.service.api.motion import RESTARTS, run_script
 from coordinator.service.core.machine_service import MachineService
@@ -30,6 +31,7 @@ Endpoint = Callable[[Client, Request], Result | Awaitable[Result]]
 
 APP: Final = "canductor"
 WHO: Final = "a client of the Klippy API"
+MESH_ARGUMENTS_MAX: Final = 32
 ALWAYS: Final = frozenset(("M105", "M115", "STATUS", "HELP"))
 """Commands that also a machine that stopped answers."""
 _EMERGENCY: Final = re.compile(r"^\s*(?:N\d+\s*)?M112\b", re.IGNORECASE | re.MULTILINE)
@@ -85,6 +87,7 @@ class Endpoints:
             "pause_resume/resume": lambda _client, _request: self._lines("RESUME"),
             "pause_resume/cancel": lambda _client, _request: self._lines("CANCEL_PRINT"),
         }
+        self._levelling: dict[str, Endpoint] = {"bed_mesh/dump_mesh": self._dump_mesh}
         self._homing: dict[str, Endpoint] = {"query_endstops/status": self._endstops}
 
     def available(self) -> Mapping[str, Endpoint]:
@@ -94,6 +97,8 @@ class Endpoints:
         if machine is not None:
             if next(machine.modules.of(PauseResume), None) is not None:
                 found |= self._pausing
+            if next(machine.modules.of(BedMesh), None) is not None:
+                found |= self._levelling
             if machine.description.stops:
                 found |= self._homing
         return found
@@ -126,6 +131,15 @@ class Endpoints:
         shown = subscription.begin(self.status.build())
         client.subscription = subscription if subscription.requested else None
         return {"eventtime": self._service.now_s, "status": shown}
+
+    def _dump_mesh(self, _client: Client, request: Request) -> Result:
+        arguments = request.params.get("mesh_args", {})
+        if not isinstance(arguments, dict) or len(arguments) > MESH_ARGUMENTS_MAX:
+            raise RequestError(f"{request.method}: the argument 'mesh_args' must be a small object")
+        try:
+            return next(self._service.up_machine().modules.of(BedMesh)).dump(arguments)
+        except WordError as error:
+            raise RequestError(f"{request.method}: {error}") from None
 
     def _endstops(self, _client: Client, _request: Request) -> Awaitable[Result]:
         job = self._service.active_job

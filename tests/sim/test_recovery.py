@@ -149,3 +149,48 @@ def test_where_z_is_not_known_it_asks(tmp_path: Path) -> None:
         assert printer.true_mm("z") == pytest.approx(LAYERS * LAYER_MM + 0.05, abs=0.01)
 
     printer.serve(first, second)
+
+
+BENT = """
+[bed_mesh]
+mesh_min: 0, 0
+mesh_max: 200, 200
+[bed_mesh bent]
+version: 1
+points: 0, 0.05, 0.1
+  0, 0.05, 0.1
+  0, 0.05, 0.1
+x_count: 3
+y_count: 3
+min_x: 0
+max_x: 200
+min_y: 0
+max_y: 200
+"""
+
+
+def test_the_mesh_is_followed_again(tmp_path: Path) -> None:
+    """The head stood higher where it followed the mesh, and goes on following it; nothing is hot."""
+    printer = Printer(tmp_path, SECTIONS + BENT)
+
+    def above_bed() -> float:
+        return printer.true_mm("z") - 0.0005 * printer.true_mm("x")
+
+    async def first(stage: Served) -> None:
+        moves = ["G28", "G90", "G1 Z0.6 F900", "G1 X60 Y100 F12000", "G1 X80 F600", f"G1 X{B_MM:g} F6000", ""]
+        stage.write_job("\n".join(moves))
+        await gcode(stage, "BED_MESH_PROFILE LOAD=bent")
+        await stage.call("job.start", file="job.gcode")
+        await stage.until(lambda: printer.true_mm("x") > 61 and printer.true_mm("y") > 99, "the slow move")
+        await asyncio.sleep(0.5)
+
+    async def second(stage: Served) -> None:
+        assert printer.true_mm("x") < 75
+        assert printer.status("bed_mesh")["profile_name"] == ""
+        await stage.call("job.recover", home=True)
+        assert printer.status("bed_mesh")["profile_name"] == "bent"
+        await stage.until_job("done")
+        assert printer.true_mm("x") == pytest.approx(B_MM, abs=0.1)
+        assert above_bed() == pytest.approx(0.6, abs=0.01)
+
+    printer.serve(first, second)

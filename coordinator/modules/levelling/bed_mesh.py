@@ -1,13 +1,12 @@
 """[bed_mesh]: the bed is probed at many points, and Z follows its shape."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from coordinator.config.errors import NotSupported
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.builtins.machine import come_to_standstill
 from coordinator.gcode.commands import (
@@ -20,7 +19,7 @@ from coordinator.gcode.commands import (
 )
 from coordinator.gcode.events import PositionSet, Reply, SurfaceChange
 from coordinator.gcode.parameters import bounded, flag, one, value
-from coordinator.gcode.parser import WordError, quoted
+from coordinator.gcode.parser import Command, WordError
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.levelling.bed_mesh_options import (
     BY_PROBE,
@@ -37,14 +36,16 @@ from coordinator.modules.levelling.bed_mesh_options import (
     read_settings,
 )
 from coordinator.modules.levelling.mesh import Grid, Mesh, Place, adapted, fitting_algorithm
-from coordinator.modules.levelling.points import ProbePoints
-from coordinator.modules.probes.probe import Measuring, Probe
+from coordinator.modules.levelling.points import ProbePoints, how_to_measure
+from coordinator.modules.probes.probe import Measured, Measuring, Probe
 from coordinator.modules.programs.exclude_object import ExcludeObject
+from coordinator.motion.steps.surface import Surface
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 DEFAULT_PROFILE: Final = "default"
+RESTORE: Final = "_BED_MESH_RESTORE"
 
 
 class BedMeshSection(Module):
@@ -88,13 +89,15 @@ class BedMesh(Module):
         self.profiles: dict[str, Mesh] = {}
         self._settings: MeshSettings | None = None
         self._points: ProbePoints | None = None
-        self._place = build.place
         self._limits = build.machine.limits
         self._mesh: Mesh | None = None
+        self._surface: Surface | None = None
         self._fine: list[Value] = [[]]
         self._profile = ""
         self._offset: Place = (0.0, 0.0)
         self._fade_offset = 0.0
+        self.to_restore: Mapping[str, Any] | None = None
+        """What ``held`` returned before a crash."""
         self._probe: Probe | None = None
         self._objects: ExcludeObject | None = None
         for name, help_, read in (
@@ -104,6 +107,7 @@ class BedMesh(Module):
             ("BED_MESH_OFFSET", "Look the mesh up X and Y further, its fade ZFADE higher", self._read_offset),
             ("BED_MESH_OUTPUT", "Report the mesh, or with PGP=1 where it is probed", self._read_output),
             ("BED_MESH_MAP", "Report the probed heights as JSON", self._read_map),
+            (RESTORE, "Let Z follow the mesh that was followed before a crash", self._read_restore),
             ("BED_MESH_CHECK", "Fail if the mesh exceeds MAX_DEVIATION or MAX_SLOPE", self._read_check),
         ):
             build.add_command(name, help_, read)
@@ -113,11 +117,10 @@ class BedMesh(Module):
         self._settings, self._points = settings, points
 
     def link(self, modules: Modules) -> None:
-        """Find the probe; raises ConfigError."""
-        self._probe = next((modules.find(name, Probe) for name in modules.names(Probe)), None)
+        """Find the probe, without which the bed is probed by hand; raises NotSupported."""
+        if self._points is not None:
+            self._probe = self._points.find_probe(modules)
         self._objects = modules.find("exclude_object", ExcludeObject)
-        if self._settings is not None and self._probe is None:
-            raise NotSupported(self._place, "it needs a probe that acts: [probe]")
 
     def status(self) -> Mapping[str, Value]:
         """Report the mesh that is followed, and all profiles, as front ends draw them."""
@@ -152,7 +155,7 @@ class BedMesh(Module):
         at_s = planner.print_time_end_s
         job.emit(SurfaceChange(job.line, surface, at_s))
         job.emit(PositionSet(job.line, "", position, at_s))
-        self._mesh, self._profile = mesh, profile
+        self._mesh, self._profile, self._surface = mesh, profile, surface
         self._fine = [[]] if mesh is None else _rows(mesh.fine_heights())
         if surface is not None:
             fastest = self._limits.max_z_velocity / max(surface.steepest, 1e-9)
@@ -166,46 +169,155 @@ class BedMesh(Module):
                 )
         return True
 
+    def dump(self, parameters: Mapping[str, object]) -> Mapping[str, Value]:
+        """Return the mesh, all profiles, and where BED_MESH_CALIBRATE would probe; raises WordError.
+
+        PARAMETERS are those of that command, by name.
+        """
+        mesh, found = self._mesh, self.status()
+        current: dict[str, Value] = {}
+        if mesh is not None:
+            current = {
+                "name": self._profile,
+                "probed_matrix": found["probed_matrix"],
+                "mesh_matrix": found["mesh_matrix"],
+                "mesh_params": _parameters(mesh),
+            }
+        offset = (0.0, 0.0, 0.0) if self._probe is None else self._probe.offset
+        return {
+            "current_mesh": current,
+            "profiles": found["profiles"],
+            "calibration": self._planned(parameters),
+            "probe_offsets": [*offset],
+            "axis_minimum": [*self._limits.position_min, 0.0],
+            "axis_maximum": [*self._limits.position_max, 0.0],
+        }
+
+    def _planned(self, parameters: Mapping[str, object]) -> dict[str, Value]:
+        """Return where BED_MESH_CALIBRATE with PARAMETERS would probe."""
+        if self._settings is None:
+            return {}
+        each = ((name.upper(), str(value).replace('"', "")) for name, value in parameters.items())
+        text = " ".join(f'{name}="{value}"' for name, value in each)
+        command = Command("BED_MESH_CALIBRATE", text)
+        grid, algorithm = self._wanted(command)
+        path: list[Value] = [[x, y] for x, y in grid.places()]
+        settings = self._settings
+        config: dict[str, Value] = {
+            "x_count": grid.counts[0],
+            "y_count": grid.counts[1],
+            "mesh_x_pps": settings.pps[0],
+            "mesh_y_pps": settings.pps[1],
+            "algo": algorithm,
+            "tension": settings.tension,
+            "min_x": grid.minimum[0],
+            "max_x": grid.maximum[0],
+            "min_y": grid.minimum[1],
+            "max_y": grid.maximum[1],
+        }
+        rapid: list[Value] = [[place, True] for place in path]
+        return {"points": path, "config": config, "probe_path": path, "rapid_path": rapid}
+
+    # ------------------------------------------------------------------------------------ after a crash
+
+    def held(self) -> Mapping[str, Any] | None:
+        """Return what RESTORE needs, for a journal; None: no mesh is followed."""
+        mesh = self._mesh
+        if mesh is None:
+            return None
+        return {
+            "profile": self._profile,
+            "heights": _rows(mesh.heights),
+            "minimum": mesh.minimum,
+            "maximum": mesh.maximum,
+            "algorithm": mesh.algorithm,
+            "tension": mesh.tension,
+            "pps": mesh.pps,
+            "offset": self._offset,
+            "z_fade": self._fade_offset,
+        }
+
+    def added_mm(self, place: tuple[float, float, float]) -> float:
+        """Return how much higher the motors are at a planned PLACE because of the mesh."""
+        if self._surface is None:
+            return 0.0
+        return self._surface.motor_z(*place) - place[2]
+
+    def _read_restore(self, call: Call) -> Reading:
+        call.parameters()
+        held = self.to_restore
+        if held is None or self._settings is None:
+            raise WordError("no mesh was followed before a crash")
+        try:
+            mesh = Mesh(
+                np.array(held["heights"], dtype=np.float64),
+                _pair(held["minimum"]),
+                _pair(held["maximum"]),
+                str(held["algorithm"]),
+                float(held["tension"]),
+                (int(held["pps"][0]), int(held["pps"][1])),
+            )
+            offset, fade_offset, profile = _pair(held["offset"]), float(held["z_fade"]), str(held["profile"])
+        except (KeyError, IndexError, TypeError, ValueError):
+            raise WordError("the mesh that was followed cannot be read") from None
+
+        def act(job: ProgramContext) -> bool:
+            self._offset, self._fade_offset = offset, fade_offset
+            return self.take(job, mesh, profile)
+
+        return ProgramAction(act)
+
     # ----------------------------------------------------------------------------------------- calibrating
 
     def _read_calibrate(self, call: Call) -> Reading:
         if self._settings is None:
             raise WordError("BED_MESH_CALIBRATE needs the section [bed_mesh], which says where to probe")
-        assert self._probe is not None
+        assert self._points is not None
         command = call.command
-        how = self._probe.how(command)
+        how = how_to_measure(call, self._probe)
         given = command.only_parameters(PARAMETERS)
-        if given.get("METHOD", "automatic").lower() not in ("automatic", "scan", "rapid_scan"):
-            raise WordError(f"METHOD of {command.name} is {quoted(given['METHOD'])}; automatic is possible")
+        grid, algorithm = self._wanted(command)
+        profile = profile_name(command, given, "PROFILE") if "PROFILE" in given else DEFAULT_PROFILE
+        by = None if how is None or self._probe is None else (self._probe, how)
+        self._points.check(call, None if by is None else by[0])
+        wanted_mesh = _Wanted(grid, algorithm, profile)
+        return Phases(lambda job: self._calibrate(job, call, by, wanted_mesh))
+
+    def _wanted(self, command: Command) -> tuple[Grid, str]:
+        """Return what COMMAND is to measure, and how its points are joined; raises WordError."""
+        assert self._settings is not None
+        given = command.only_parameters(PARAMETERS)
         grid = grid_for(command, given, self._settings.grid)
         if flag(command, given, "ADAPTIVE"):
             margin = bounded(command, given, "ADAPTIVE_MARGIN", self._settings.margin, low=0, high=1000)
             grid = adapted(grid, self._outlines(), margin)
         try:
             wanted = given.get("ALGORITHM", self._settings.algorithm).lower()
-            algorithm = fitting_algorithm(wanted, grid.counts)
+            return grid, fitting_algorithm(wanted, grid.counts)
         except ValueError as error:
             raise WordError(f"{command.name}: {error}") from None
-        profile = profile_name(command, given, "PROFILE") if "PROFILE" in given else DEFAULT_PROFILE
-        self._probe.check(call)
-        wanted_mesh = _Wanted(grid, algorithm, profile)
-        return Phases(lambda job: self._calibrate(job, call, how, wanted_mesh))
 
     def _calibrate(
-        self, job: ProgramContext, call: Call, how: Measuring, wanted: "_Wanted"
+        self, job: ProgramContext, call: Call, by: tuple[Probe, Measuring] | None, wanted: "_Wanted"
     ) -> Iterator[Reading]:
-        grid, profile = wanted.grid, wanted.profile
         assert self._settings is not None
         assert self._points is not None
-        assert self._probe is not None
         yield ProgramAction(lambda job: self.take(job, None))
-        places, zero = grid.places(), self._settings.zero
+        places, zero = wanted.grid.places(), self._settings.zero
         if zero is not None and zero not in places:
             places.append(zero)
-        measured = yield from self._points.measure(job, call.command, self._probe, how, places=places)
-        if measured is None:
-            return
-        height = {place: found.bed[2] for place, found in zip(places, measured, strict=True)}
+
+        def found(job: ProgramContext, measured: list[Measured]) -> Iterator[Reading]:
+            del job
+            height = {place: one.bed[2] for place, one in zip(places, measured, strict=True)}
+            yield from self._measured(call, wanted, height)
+
+        yield from self._points.collect(job, call, by, found, places=places)
+
+    def _measured(self, call: Call, wanted: "_Wanted", height: Mapping[Place, float]) -> Iterator[Reading]:
+        """Make a mesh of the bed's HEIGHT at the places of a grid, and follow it."""
+        assert self._settings is not None
+        grid, profile, zero = wanted.grid, wanted.profile, self._settings.zero
         try:
             heights = grid.heights(height.__getitem__)
         except ValueError as error:
@@ -318,6 +430,11 @@ def _save(live: ModuleContext, name: str, mesh: Mesh) -> None:
         live.save(f"bed_mesh {name}", option, text)
 
 
+def _pair(numbers: Sequence[Any]) -> Place:
+    x, y = numbers
+    return float(x), float(y)
+
+
 def _rows(heights: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[Value]:
     return [[round(float(height), 6) for height in row] for row in heights]
 
@@ -325,18 +442,22 @@ def _rows(heights: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[Va
 def _told(mesh: Mesh) -> dict[str, Value]:
     return {
         "points": _rows(mesh.heights),
-        "mesh_params": {
-            "min_x": mesh.minimum[0],
-            "max_x": mesh.maximum[0],
-            "min_y": mesh.minimum[1],
-            "max_y": mesh.maximum[1],
-            "x_count": mesh.counts[0],
-            "y_count": mesh.counts[1],
-            "mesh_x_pps": mesh.pps[0],
-            "mesh_y_pps": mesh.pps[1],
-            "algo": mesh.algorithm,
-            "tension": mesh.tension,
-        },
+        "mesh_params": _parameters(mesh),
+    }
+
+
+def _parameters(mesh: Mesh) -> dict[str, Value]:
+    return {
+        "min_x": mesh.minimum[0],
+        "max_x": mesh.maximum[0],
+        "min_y": mesh.minimum[1],
+        "max_y": mesh.maximum[1],
+        "x_count": mesh.counts[0],
+        "y_count": mesh.counts[1],
+        "mesh_x_pps": mesh.pps[0],
+        "mesh_y_pps": mesh.pps[1],
+        "algo": mesh.algorithm,
+        "tension": mesh.tension,
     }
 
 

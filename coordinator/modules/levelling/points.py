@@ -1,17 +1,20 @@
 """Places that are probed one after the other: the options that name them, and the ways between them."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from coordinator.config.errors import NotSupported
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option
 from coordinator.config.sections.bounds import MAX_POSITION, MAX_SPEED
 from coordinator.gcode.builtins.state import go
-from coordinator.gcode.commands import ProgramAction, ProgramContext, Reading
+from coordinator.gcode.commands import Call, Immediate, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.parameters import bounded
-from coordinator.gcode.parser import Command
-from coordinator.modules.base import Build
+from coordinator.gcode.parser import Command, WordError, quoted
+from coordinator.kinematics.base import Point
+from coordinator.modules.base import Build, Modules
 from coordinator.modules.levelling.surfaces import Place
+from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.probes.probe import Measured, Measuring, Probe, lift
 
 
@@ -76,6 +79,34 @@ BY_PROBE: Final = BoolOption(
 OPTIONS: Final[tuple[Option[Any], ...]] = (TRAVEL_SPEED, HEIGHT, BY_PROBE)
 
 
+Found = Callable[[ProgramContext, list[Measured]], Iterator[Reading]]
+"""What follows when all places are measured."""
+PROBES: Final = (
+    *("probe", "bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe", "dockable_probe"),
+    *("cartographer", "beacon", "scanner"),
+)
+"""First words of sections of probes, of which some may not act yet."""
+AUTOMATIC: Final = ("automatic", "scan", "rapid_scan")
+MANUAL: Final = "manual"
+
+
+def how_to_measure(call: Call, probe: Probe | None) -> Measuring | None:
+    """Return how CALL measures by PROBE, None: by hand, as METHOD says; raises WordError.
+
+    Without METHOD it is by the probe, where there is one.
+    """
+    command = call.command
+    written = call.parameters("METHOD").get("METHOD", MANUAL if probe is None else AUTOMATIC[0])
+    method = written.lower()
+    if method == MANUAL:
+        return None
+    if method not in AUTOMATIC:
+        raise WordError(f"METHOD of {command.name} is {quoted(written)}; automatic and manual are possible")
+    if probe is None:
+        raise WordError(f"METHOD of {command.name} is {method}, and there is no probe; give METHOD=manual")
+    return probe.how(command)
+
+
 class ProbePoints:
     """The PLACES of a section, with its OPTIONS."""
 
@@ -83,8 +114,21 @@ class ProbePoints:
         self, build: Build, places: Sequence[Place] = (), *, by_probe: BoolOption = BY_PROBE
     ) -> None:
         self.places = tuple(places)
+        self._manual = build.shared(ManualProbe)
+        self._place = build.place
+        self._left_out = [name for name in build.unsupported if name.partition(" ")[0] in PROBES]
         self._speed, self._height = build.get(TRAVEL_SPEED), build.get(HEIGHT)
         self._by_probe = build.get(by_probe)
+
+    def find_probe(self, modules: Modules) -> Probe | None:
+        """Return the probe, None where there is none; raises NotSupported for one that does not act yet.
+
+        A program that measures by such a probe must not wait for someone to measure by hand.
+        """
+        found = next((modules.find(name, Probe) for name in modules.names(Probe)), None)
+        if found is None and self._left_out:
+            raise NotSupported(self._place, f"it needs [{self._left_out[0]}], which is not supported yet")
+        return found
 
     def height(self, command: Command) -> float:
         """Return how high the head travels by COMMAND, or as configured; raises WordError."""
@@ -116,6 +160,56 @@ class ProbePoints:
         yield from lift(job, height, how.lift_speed)
         yield from probe.stow(job, command)
         return found
+
+    def check(self, call: Call, probe: Probe | None) -> None:
+        """Raise WordError where nothing can be measured, by PROBE or else by hand."""
+        self.height(call.command)
+        if probe is None:
+            self._manual.check_free(call)
+        else:
+            probe.check(call)
+
+    def collect(
+        self,
+        job: ProgramContext,
+        call: Call,
+        by: tuple[Probe, Measuring] | None,
+        found: Found,
+        *,
+        places: Sequence[Place] | None = None,
+    ) -> Iterator[Reading]:
+        """Measure all places (or PLACES) in turn, then go on with FOUND; BY a probe, None: by hand.
+
+        By hand the nozzle goes to each place, ACCEPT takes the height and leads to the next one.
+        """
+        places = self.places if places is None else places
+        if by is None:
+            yield from self._look_for(job, call.command, tuple(places), [], found)
+            return
+        measured = yield from self.measure(job, call.command, *by, places=places)
+        if measured is not None:
+            yield from found(job, measured)
+
+    def _look_for(
+        self,
+        job: ProgramContext,
+        command: Command,
+        places: tuple[Place, ...],
+        known: list[Measured],
+        found: Found,
+    ) -> Iterator[Reading]:
+        yield from lift(job, self.height(command), self._speed)
+        if len(known) == len(places):
+            yield from found(job, known)
+            return
+        x, y = places[len(known)]
+        yield ProgramAction(lambda job: go(job, [x, y, *job.planner.toolhead_position[2:]], self._speed))
+        yield Immediate((f"place {len(known) + 1} of {len(places)}: {x:.3f},{y:.3f}",))
+
+        def accepted(job: ProgramContext, at: Point) -> Iterator[Reading]:
+            yield from self._look_for(job, command, places, [*known, Measured(at, at)], found)
+
+        yield self._manual.follow(job.call(command), accepted)
 
     def travel(
         self, job: ProgramContext, probe: Probe, place: Place, height: float, lift_speed: float

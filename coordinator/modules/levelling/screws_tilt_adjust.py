@@ -3,16 +3,15 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from coordinator.config.errors import NotSupported
 from coordinator.config.options import ChoiceOption, Option, SectionSpec
 from coordinator.gcode.commands import Call, Immediate, Phases, ProgramContext, Reading
 from coordinator.gcode.parameters import bounded
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.levelling.points import OPTIONS, ProbePoints
+from coordinator.modules.levelling.points import OPTIONS, ProbePoints, how_to_measure
 from coordinator.modules.levelling.screw_turns import THREADS, Turn, screw_turns
 from coordinator.modules.levelling.screws import SCREW, read_screws
-from coordinator.modules.probes.probe import Measured, Measuring, Probe
+from coordinator.modules.probes.probe import Measured, Probe
 from coordinator.support.values import Value
 
 THREAD: Final = ChoiceOption(
@@ -34,7 +33,7 @@ class ScrewsTiltAdjust(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._screws = read_screws(build, own=(THREAD.name,), fine=False)
-        self._thread, self._place = build.get(THREAD), build.place
+        self._thread = build.get(THREAD)
         self._points = ProbePoints(build, [screw.place for screw in self._screws])
         self._probe: Probe | None = None
         self._turns: tuple[Turn, ...] = ()
@@ -43,10 +42,8 @@ class ScrewsTiltAdjust(Module):
         build.add_command("SCREWS_TILT_CALCULATE", "Report how far each screw has to be turned", self._read)
 
     def link(self, modules: Modules) -> None:
-        """Find the probe; raises NotSupported."""
-        self._probe = next((modules.find(name, Probe) for name in modules.names(Probe)), None)
-        if self._probe is None:
-            raise NotSupported(self._place, "it needs a probe that acts: [probe]")
+        """Find the probe, without which the bed is probed by hand; raises NotSupported."""
+        self._probe = self._points.find_probe(modules)
 
     def status(self) -> Mapping[str, Value]:
         """Report what was found last."""
@@ -65,7 +62,6 @@ class ScrewsTiltAdjust(Module):
         }
 
     def _read(self, call: Call) -> Reading:
-        assert self._probe is not None
         given = call.parameters("DIRECTION", "MAX_DEVIATION")
         direction = given.get("DIRECTION", "").upper()
         if direction not in ("", "CW", "CCW"):
@@ -73,20 +69,23 @@ class ScrewsTiltAdjust(Module):
                 f"DIRECTION of {call.command.name} is {quoted(given['DIRECTION'])}; give CW or CCW"
             )
         limit = bounded(call.command, given, "MAX_DEVIATION", None, low=0, high=MAX_MM)
-        self._points.height(call.command)
-        how = self._probe.how(call.command)
-        self._probe.check(call)
-        return Phases(lambda job: self._run(job, call, how, (direction, limit)))
+        how = how_to_measure(call, self._probe)
+        by = None if how is None or self._probe is None else (self._probe, how)
+        self._points.check(call, None if by is None else by[0])
 
-    def _run(
-        self, job: ProgramContext, call: Call, how: Measuring, wanted: tuple[str, float | None]
+        def found(job: ProgramContext, measured: list[Measured]) -> Iterator[Reading]:
+            del job
+            yield from self._measured(call, measured, direction, limit)
+
+        def run(job: ProgramContext) -> Iterator[Reading]:
+            self._turns, self._limit, self._failed = (), limit, False
+            yield from self._points.collect(job, call, by, found)
+
+        return Phases(run)
+
+    def _measured(
+        self, call: Call, found: Sequence[Measured], direction: str, limit: float | None
     ) -> Iterator[Reading]:
-        assert self._probe is not None
-        direction, limit = wanted
-        self._turns, self._limit, self._failed = (), limit, False
-        found = yield from self._points.measure(job, call.command, self._probe, how)
-        if found is None:
-            return
         self._turns = screw_turns([one.nozzle[2] for one in found], self._thread, direction)
         yield Immediate(tuple(self._report(found)))
         worst_mm = max(abs(turn.rise_mm) for turn in self._turns)

@@ -4,10 +4,6 @@
 
 #include <string.h>
 
-static const struct trapezoid *move_at(const struct step_gen *gen, uint64_t number) {
-    return &gen->moves[number % STEP_TRAPEZOIDS];
-}
-
 static double length_of(const struct trapezoid *m) {
     return (m->start_v + 0.5 * m->accel * m->accel_s) * m->accel_s + m->cruise_v * m->cruise_s +
            (m->cruise_v - 0.5 * m->accel * m->decel_s) * m->decel_s;
@@ -23,25 +19,25 @@ void step_end_position(const struct step_gen *gen, double *position) {
     if (gen->kept_from == gen->moves_to)
         memcpy(position, gen->rest, sizeof(gen->rest));
     else
-        step_move_end_position(move_at(gen, gen->moves_to - 1), position);
+        step_move_end_position(step_move(gen, gen->moves_to - 1), position);
 }
 
 static void locate_rest(const struct step_gen *gen, uint64_t cursor, struct motion *out) {
     static const double NO_WAY[AXES] = {0};
-    const double border = cursor < gen->moves_to ? move_at(gen, cursor)->print_time : HUGE_VAL;
+    const double border = cursor < gen->moves_to ? step_move(gen, cursor)->print_time : HUGE_VAL;
     if (cursor == gen->kept_from) {
         *out = (struct motion){.from = gen->rest, .ratio = NO_WAY, .border = border};
         return;
     }
-    const struct trapezoid *m = move_at(gen, cursor - 1);
+    const struct trapezoid *m = step_move(gen, cursor - 1);
     *out = (struct motion){.from = m->start, .ratio = m->ratio, .way = length_of(m), .border = border};
 }
 
 void step_locate(const struct step_gen *gen, uint64_t *cursor, double time, struct motion *out) {
     *cursor = *cursor < gen->kept_from ? gen->kept_from : *cursor;
-    while (*cursor < gen->moves_to && is_over(move_end(move_at(gen, *cursor)), time))
+    while (*cursor < gen->moves_to && is_over(move_end(step_move(gen, *cursor)), time))
         ++*cursor;
-    const struct trapezoid *m = move_at(gen, *cursor);
+    const struct trapezoid *m = step_move(gen, *cursor);
     if (*cursor == gen->moves_to || m->print_time > time + ROUNDING_S) {
         locate_rest(gen, *cursor, out);
         return;
@@ -70,6 +66,8 @@ void step_forget(struct stepper *s) {
         s->seen[i].border = -HUGE_VAL;
     s->trusted = 0;
     s->known_off = HUGE_VAL;
+    s->passed = 0;
+    s->stay = -HUGE_VAL;
 }
 
 static void add_tap(struct step_gen *gen, int axis, double amplitude, double time) {
@@ -108,11 +106,14 @@ void step_choose_way(struct step_gen *gen, struct stepper *s) {
     s->uses |= s->follows_bed ? STEP_USES_X | STEP_USES_Y : 0;
     const bool smooth = s->smooth_s > 0 && s->uses & USES_E;
     s->reach = s->lag = smooth ? s->smooth_s / 2 : 0;
+    s->between = s->follows_bed && !s->config.formula;
     s->curve = smooth || s->config.formula || s->follows_bed;
     for (int i = 0; i < gen->tap_count; i++)
         if (gen->taps[i].axes & s->uses) {
             s->reach = fmax(s->reach, -gen->taps[i].time);
             s->lag = fmax(s->lag, gen->taps[i].time);
+            for (int j = AXIS_X; j <= AXIS_Z; j++)
+                s->between &= gen->taps[i].amplitude[j] >= 0;
         }
     s->curve |= s->reach > 0 || s->lag > 0;
 }

@@ -72,7 +72,7 @@ double step_absolute(const struct step_gen *gen, struct stepper *s, const double
     double at[AXES], still[AXES] = {0}, speed;
     memcpy(at, position, sizeof(at));
     if (s->follows_bed)
-        step_surface_add(&gen->surface, at, still);
+        step_surface_add(&gen->surface, at, still, NULL);
     if (!s->config.formula)
         return mix(s->config.weights, at) / s->config.step_distance;
     s->angle = s->config.formula->position(s->config.params, s->angle, at, still, &speed);
@@ -284,7 +284,7 @@ int step_set_smooth_time(struct step_gen *gen, int stepper, double smooth_s) {
 }
 
 int step_set_surface(struct step_gen *gen, const struct step_surface *grid, double *z) {
-    if (!step_surface_is_legal(grid))
+    if (!step_surface_is_legal(grid) || (grid->points_x && !grid->patches))
         return STEP_BAD_CONFIG;
     for (const struct stepper *s = gen->steppers; grid->points_x && s < gen->steppers + gen->stepper_count;
          s++)

@@ -16,6 +16,7 @@ static const double CLOSE_S = 1e-8; // a change by Newton after which the next w
 enum { NEWTONS = 4, SOLVED = 256 };
 static const double NOISE_STEPS = 1e-7; // a stepper whose place changes by less in a span stands there
 static const double STANDS_S = 0.001;   // at least, to be sure that it is no turn
+static const double LEVEL_MM = 1e-9;    // less is rounding of a Z that stays
 
 struct piece {
     double begin, seconds;
@@ -24,9 +25,17 @@ struct piece {
     bool linear, smooth, still;
 };
 
-// The position since init at TIME after the piece's begin, in steps, and its speed.
-static double evaluate(const struct step_gen *gen, const struct stepper *s, const struct piece *p, double t,
-                       double *speed) {
+// Where a stepper is at a time of a piece.
+struct moment {
+    double t;         // s since the piece's begin
+    double at, speed; // steps since init, steps/s
+    double slope[2];  // of the bed along X and Y, where it is followed
+};
+
+// The position since init at TIME after the piece's begin, in steps, and its speed; SLOPE: of the bed, or
+// NULL.
+static double evaluate_over(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
+                            double t, double *speed, double slope[2]) {
     const double *c = p->poly;
     if (p->linear) {
         *speed = c[1] + t * (2 * c[2] + t * (3 * c[3] + t * 4 * c[4]));
@@ -38,7 +47,7 @@ static double evaluate(const struct step_gen *gen, const struct stepper *s, cons
         v[i] = p->axis[i][1] + 2 * t * p->axis[i][2];
     }
     if (s->follows_bed)
-        step_surface_add(&gen->surface, at, v);
+        step_surface_add(&gen->surface, at, v, slope);
     double u = 0;
     *speed = 0;
     if (s->config.formula)
@@ -48,6 +57,18 @@ static double evaluate(const struct step_gen *gen, const struct stepper *s, cons
             u += s->config.weights[i] * at[i], *speed += s->config.weights[i] * v[i];
     *speed /= s->config.step_distance;
     return u / s->config.step_distance - s->origin;
+}
+
+static double evaluate(const struct step_gen *gen, const struct stepper *s, const struct piece *p, double t,
+                       double *speed) {
+    return evaluate_over(gen, s, p, t, speed, NULL);
+}
+
+static struct moment moment_at(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
+                               double t) {
+    struct moment m = {.t = t};
+    m.at = evaluate_over(gen, s, p, t, &m.speed, m.slope);
+    return m;
 }
 
 // Looks through a tap again: the weighted sum of the axes that it shows, in steps.
@@ -197,8 +218,8 @@ static double fastest(const double c[3], double from, double to) {
 // Where a linear stepper over a bed turns at most once behind FROM: it cannot turn at all before its speed is
 // used up by the most that the bed's bends and its axes can change it.
 static double bed_cut(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
-                      double from) {
-    const double to = p->seconds, *weights = s->config.weights;
+                      const struct moment *begin) {
+    const double from = begin->t, to = p->seconds, *weights = s->config.weights;
     const struct range x = range_of(p->axis[AXIS_X], from, to), y = range_of(p->axis[AXIS_Y], from, to),
                        z = range_of(p->axis[AXIS_Z], from, to);
     if (!step_surface_is_smooth(&gen->surface, x.low, x.high, y.low, y.high, z.low, z.high))
@@ -209,35 +230,105 @@ static double bed_cut(const struct step_gen *gen, const struct stepper *s, const
                                                   2 * fabs(p->axis[AXIS_X][2]), 2 * fabs(p->axis[AXIS_Y][2]));
     for (int i = 0; i < AXES; i++)
         change += 2 * fabs(weights[i] * p->axis[i][2]);
-    double speed;
-    evaluate(gen, s, p, from, &speed);
-    return from + fmax(SPAN_S, fabs(speed) * s->config.step_distance / change);
+    return from + fmax(SPAN_S, fabs(begin->speed) * s->config.step_distance / change);
 }
 
-// Whether a linear stepper over a bed can reach no step in the piece, from where it was last evaluated:
-// mostly.
+// Whether a linear stepper over a bed reaches no step while its axes are no further than LOW to HIGH (mm)
+// from where it was last evaluated, and |slope there · way| is at most ALONG. Where the bed is smooth, that
+// slope says more than the steepest one.
+static bool stays_near(const struct step_gen *gen, const struct stepper *s, const double low[3],
+                       const double high[3], double along) {
+    const double *weights = s->config.weights, *known = s->known_at;
+    const double room = (0.5 - 2.0 / STEP_SNAP - fabs(s->known_off)) * s->config.step_distance;
+    double far[3], straight = 0; // by the weights alone
+    for (int i = 0; i < 3; i++) {
+        far[i] = fmax(fabs(low[i]), fabs(high[i]));
+        straight += fabs(weights[i]) * far[i];
+    }
+    const double z = fabs(weights[AXIS_Z]);
+    if (straight + z * step_surface_change(&gen->surface, far) < room)
+        return true;
+    return far[AXIS_Z] < LEVEL_MM && straight + z * (along + step_surface_curl(&gen->surface, far)) < room &&
+           step_surface_is_smooth(&gen->surface, known[0] + low[0], known[0] + high[0], known[1] + low[1],
+                                  known[1] + high[1], known[2], known[2]);
+}
+
+// Whether it can reach no step in the piece: mostly.
 static bool reaches_nothing(const struct step_gen *gen, const struct stepper *s, const struct piece *p) {
-    if (s->config.formula || p->still)
+    if (s->config.formula || p->still || s->known_off == HUGE_VAL)
         return false;
-    double far[3]; // mm, no further does an axis get from there
-    for (int i = 0; i < 3; i++)
-        far[i] = fabs(p->axis[i][0] - s->known_at[i]) + fastest(p->axis[i], 0, p->seconds) * p->seconds;
-    const double *weights = s->config.weights;
-    double most = fabs(weights[AXIS_Z]) * step_surface_change(&gen->surface, far);
-    for (int i = 0; i < 3; i++)
-        most += fabs(weights[i]) * far[i];
-    return fabs(s->known_off) + most / s->config.step_distance < 0.5 - 2.0 / STEP_SNAP;
+    double low[3], high[3], along = 0, turned = 0;
+    for (int i = 0; i < 3; i++) {
+        const double gone = p->axis[i][0] - s->known_at[i];
+        const double way = fastest(p->axis[i], 0, p->seconds) * p->seconds;
+        low[i] = gone - way, high[i] = gone + way;
+        if (i < 2)
+            along += s->known_slope[i] * gone, turned += fabs(s->known_slope[i]) * way;
+    }
+    return stays_near(gen, s, low, high, fabs(along) + turned);
 }
 
-// The first time after FROM behind which the stepper's speed may behave otherwise.
+// Where the axes get from where a stepper was last evaluated, mm.
+struct box {
+    double low[3], high[3];
+};
+
+static void extend(struct box *box, const double known[3], const double at[AXES]) {
+    for (int i = 0; i < 3; i++) {
+        box->low[i] = fmin(box->low[i], at[i] - known[i]);
+        box->high[i] = fmax(box->high[i], at[i] - known[i]);
+    }
+}
+
+static bool stays_in_box(const struct step_gen *gen, const struct stepper *s, const struct box *b) {
+    double least = 0, most = 0;
+    for (int i = 0; i < 2; i++) {
+        const double one = s->known_slope[i] * b->low[i], other = s->known_slope[i] * b->high[i];
+        least += fmin(one, other), most += fmax(one, other);
+    }
+    return stays_near(gen, s, b->low, b->high, fmax(fabs(least), fabs(most)));
+}
+
+// Passes whole moves on which a linear stepper over a bed reaches no step: what it sees of them through
+// shapers lies between places of the axes. Where that gets it no further, not before the move is over.
+static void pass_moves(const struct step_gen *gen, struct stepper *s, double until) {
+    if (!s->between || s->known_off == HUGE_VAL || s->time < s->stay)
+        return;
+    uint64_t n = s->passed < gen->kept_from ? gen->kept_from : s->passed;
+    while (n < gen->moves_to && is_over(move_end(step_move(gen, n)), s->time - s->lag))
+        n++;
+    s->passed = n;
+    if (n == gen->moves_to)
+        return;
+    struct box box = {.low = {HUGE_VAL, HUGE_VAL, HUGE_VAL}, .high = {-HUGE_VAL, -HUGE_VAL, -HUGE_VAL}};
+    double at[AXES], end = s->time;
+    if (n > gen->kept_from)
+        step_move_end_position(step_move(gen, n - 1), at);
+    extend(&box, s->known_at, n > gen->kept_from ? at : gen->rest);
+    for (; n < gen->moves_to && end < until; n++) {
+        const struct trapezoid *m = step_move(gen, n);
+        step_move_end_position(m, at);
+        extend(&box, s->known_at, m->start);
+        extend(&box, s->known_at, at);
+        if (!stays_in_box(gen, s, &box))
+            break;
+        end = (n + 1 < gen->moves_to ? step_move(gen, n + 1)->print_time : move_end(m)) - s->reach;
+    }
+    if (end > s->time)
+        s->time = fmin(end, until), s->checked = -1;
+    else
+        s->stay = move_end(step_move(gen, s->passed)) + s->lag;
+}
+
+// The first time after BEGIN behind which the stepper's speed may behave otherwise.
 static double next_cut(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
-                       double from) {
-    const double *c = p->poly;
+                       const struct moment *begin) {
+    const double *c = p->poly, from = begin->t;
     double cut = p->seconds;
     if (p->still)
         return cut;
     if (!p->linear)
-        return fmin(cut, s->config.formula ? from + SPAN_S : bed_cut(gen, s, p, from));
+        return fmin(cut, s->config.formula ? from + SPAN_S : bed_cut(gen, s, p, begin));
     if (!p->smooth) {
         const double turn = -c[1] / (2 * c[2]); // not finite in a cruise
         return turn > from + EXACT_S && turn < cut ? turn : cut;
@@ -252,14 +343,14 @@ static double next_cut(const struct step_gen *gen, const struct stepper *s, cons
     return cut;
 }
 
-// Where the speed changes its sign between FROM and TO, or TO.
-static double find_turn(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
-                        double from, double to) {
-    double first, last, speed, low = from, high = to;
-    evaluate(gen, s, p, from, &first);
-    evaluate(gen, s, p, to, &last);
-    if (!(first * last < 0))
-        return to;
+// Where the speed changes its sign behind FROM and before END, or END.
+static struct moment find_turn(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
+                               const struct moment *from, double end) {
+    const struct moment last = moment_at(gen, s, p, end);
+    const double first = from->speed;
+    double speed, low = from->t, high = end;
+    if (!(first * last.speed < 0))
+        return last;
     while (high - low > EXACT_S) {
         const double middle = 0.5 * (low + high);
         if (middle <= low || middle >= high)
@@ -270,7 +361,8 @@ static double find_turn(const struct step_gen *gen, const struct stepper *s, con
         else
             high = middle;
     }
-    return high - from > 2 * EXACT_S && to - high > 2 * EXACT_S ? high : to;
+    const bool inside = high - from->t > 2 * EXACT_S && end - high > 2 * EXACT_S;
+    return inside ? moment_at(gen, s, p, high) : last;
 }
 
 // The time in FROM..TO at which the stepper, moving in DIRECTION, is at BOUNDARY; GUESS is any time.
@@ -366,9 +458,10 @@ static int play_solved(struct step_gen *gen, struct stepper *s, const struct pie
     return STEP_OK;
 }
 
-static int play_span(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to) {
-    double v0, v1;
-    const double begin = evaluate(gen, s, p, from, &v0), end = evaluate(gen, s, p, to, &v1);
+static int play_span(struct step_gen *gen, struct stepper *s, const struct piece *p,
+                     const struct moment *first, const struct moment *last) {
+    const double from = first->t, to = last->t, v0 = first->speed, v1 = last->speed;
+    const double begin = first->at, end = last->at;
     if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
         return step_fail(gen, STEP_BAD_MOVE, s, p->begin, end);
     const bool stands = p->still || fabs(end - begin) < NOISE_STEPS;
@@ -397,38 +490,43 @@ static int play_span(struct step_gen *gen, struct stepper *s, const struct piece
 }
 
 static int play_piece(struct step_gen *gen, struct stepper *s, const struct piece *p) {
-    double speed;
     if (s->follows_bed && reaches_nothing(gen, s, p))
         return STEP_OK;
-    const double off = evaluate(gen, s, p, 0, &speed) - (double)s->position;
+    struct moment from = moment_at(gen, s, p, 0);
+    const double off = from.at - (double)s->position;
     if (s->time != s->checked && !(fabs(off) <= JUMP_STEPS))
         return step_fail(gen, STEP_JUMP, s, p->begin, off);
     s->checked = s->time;
     if (s->follows_bed) {
         for (int i = 0; i < 3; i++)
             s->known_at[i] = p->axis[i][0];
+        s->known_slope[0] = from.slope[0], s->known_slope[1] = from.slope[1];
         s->known_off = off;
         if (reaches_nothing(gen, s, p))
             return STEP_OK;
         s->known_off = HUGE_VAL; // it steps on
     }
-    for (double from = 0; from < p->seconds;) {
-        double to = next_cut(gen, s, p, from);
-        if (!p->still && (!p->linear || p->smooth))
-            to = find_turn(gen, s, p, from, to);
-        const int status = play_span(gen, s, p, from, to);
+    while (from.t < p->seconds) {
+        const double end = next_cut(gen, s, p, &from);
+        const bool turns = !p->still && (!p->linear || p->smooth);
+        const struct moment to = turns ? find_turn(gen, s, p, &from, end) : moment_at(gen, s, p, end);
+        const int status = play_span(gen, s, p, &from, &to);
         if (status)
             return status;
         if (s->config.formula && s->config.formula->unwraps)
-            s->angle = (evaluate(gen, s, p, to, &speed) + s->origin) * s->config.step_distance;
+            s->angle = (to.at + s->origin) * s->config.step_distance;
         from = to;
-        s->time = s->checked = p->begin + to; // steps up to here are done, whatever comes
+        s->time = s->checked = p->begin + to.t; // steps up to here are done, whatever comes
     }
     return STEP_OK;
 }
 
 int step_curve_advance(struct step_gen *gen, struct stepper *s, double until) {
     while (s->time < until - ROUNDING_S) {
+        if (s->follows_bed)
+            pass_moves(gen, s, until);
+        if (!(s->time < until - ROUNDING_S))
+            break;
         struct piece piece;
         make_piece(gen, s, until, &piece);
         const int status = play_piece(gen, s, &piece);

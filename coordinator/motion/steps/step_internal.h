@@ -64,7 +64,11 @@ struct stepper {
     // A stepper whose steps are not those of one move after the other: see step_curve.c.
     bool curve;
     bool follows_bed;               // its place depends on the shape of the bed
+    bool between;                   // linear, over a bed, and never beyond places of its axes
     double known_at[3], known_off;  // X Y Z where that was last evaluated, and how far from its steps it was
+    double known_slope[2];          // of the bed there, by X and Y
+    uint64_t passed;                // the move that the next try to pass whole moves begins with
+    double stay;                    // s, up to which such a try is in vain
     unsigned uses;                  // axes, a bit each
     double time, border;            // s: solved up to; to be solved up to
     double checked;                 // s, where it was last seen to be where it should; -1: nowhere
@@ -187,6 +191,10 @@ struct step_gen {
     double moves_end, max_error_s;
     struct step_error error;
 };
+
+static inline const struct trapezoid *step_move(const struct step_gen *gen, uint64_t number) {
+    return &gen->moves[number % STEP_TRAPEZOIDS];
+}
 
 static inline double move_end(const struct trapezoid *m) {
     return m->print_time + m->accel_s + m->cruise_s + m->decel_s;

@@ -13,13 +13,39 @@ struct height {
 
 // ------------------------------------------------------------------------------------------- bicubic patches
 
-// Weights of a cubic's (value, slope·width) at 0 and (value, slope·width) at 1.
-static void weights_at(double u, double value[4], double slope[4]) {
-    const double v = 1 - u;
-    value[0] = v * v * (1 + 2 * u), value[1] = u * v * v;
-    value[2] = u * u * (3 - 2 * u), value[3] = -u * u * v;
-    slope[0] = -6 * u * v, slope[1] = v * (1 - 3 * u);
-    slope[2] = 6 * u * v, slope[3] = u * (3 * u - 2);
+// A cubic on 0..1 as powers, from its value and slope at 0 and at 1.
+static void cubic(const double known[4], double powers[4]) {
+    const double rise = known[2] - known[0];
+    powers[0] = known[0], powers[1] = known[1];
+    powers[2] = 3 * rise - 2 * known[1] - known[3];
+    powers[3] = known[1] + known[3] - 2 * rise;
+}
+
+static void make_patch(const struct step_surface *g, int i, int j, double *patch) {
+    const double scale[4] = {1, g->step_x, g->step_y, g->step_x * g->step_y};
+    double along_y[4][4]; // of value and slope by X at both ends of the patch: powers of V
+    for (int k = 0; k < 4; k++) {
+        double known[4]; // value, slope at Y 0, and at Y 1
+        for (int q = 0; q < 2; q++) {
+            const double *node = g->nodes + 4 * ((size_t)(j + q) * (size_t)g->points_x + (size_t)(i + k / 2));
+            for (int by_y = 0; by_y < 2; by_y++)
+                known[2 * q + by_y] = node[k % 2 + 2 * by_y] * scale[k % 2 + 2 * by_y];
+        }
+        cubic(known, along_y[k]);
+    }
+    for (int n = 0; n < 4; n++) {
+        const double known[4] = {along_y[0][n], along_y[1][n], along_y[2][n], along_y[3][n]};
+        double powers[4];
+        cubic(known, powers);
+        for (int k = 0; k < 4; k++)
+            patch[4 * k + n] = powers[k];
+    }
+}
+
+void step_surface_make_patches(const struct step_surface *g, double *patches) {
+    for (int j = 0; j + 1 < g->points_y; j++)
+        for (int i = 0; i + 1 < g->points_x; i++, patches += 16)
+            make_patch(g, i, j, patches);
 }
 
 // The interval of the axis in which AT lies, and where in it, 0..1; OUTSIDE: beyond the edge.
@@ -36,28 +62,20 @@ static int interval(double at, double from, double step, int points, double *sha
 }
 
 static struct height height_at(const struct step_surface *g, double x, double y) {
-    double u, v, a[4], da[4], b[4], db[4];
+    double u, v, r[4], slope[4];
     bool out_x, out_y;
     const int i = interval(x, g->from_x, g->step_x, g->points_x, &u, &out_x);
     const int j = interval(y, g->from_y, g->step_y, g->points_y, &v, &out_y);
-    weights_at(u, a, da);
-    weights_at(v, b, db);
-    const double scale[4] = {1, g->step_x, g->step_y, g->step_x * g->step_y};
-    struct height h = {0};
-    for (int p = 0; p < 2; p++)
-        for (int q = 0; q < 2; q++) {
-            const double *node = g->nodes + 4 * ((size_t)(j + q) * (size_t)g->points_x + (size_t)(i + p));
-            for (int k = 0; k < 4; k++) { // height, by x, by y, by both
-                const int along_x = 2 * p + (k & 1), along_y = 2 * q + (k >> 1);
-                const double value = node[k] * scale[k];
-                h.z += value * a[along_x] * b[along_y];
-                h.by_x += value * da[along_x] * b[along_y];
-                h.by_y += value * a[along_x] * db[along_y];
-            }
-        }
-    h.by_x = out_x ? 0 : h.by_x / g->step_x;
-    h.by_y = out_y ? 0 : h.by_y / g->step_y;
-    return h;
+    const double *c = g->patches + 16 * ((size_t)j * (size_t)(g->points_x - 1) + (size_t)i);
+    for (int k = 0; k < 4; k++) { // coefficients of V^k
+        r[k] = c[k] + u * (c[4 + k] + u * (c[8 + k] + u * c[12 + k]));
+        slope[k] = c[4 + k] + u * (2 * c[8 + k] + u * 3 * c[12 + k]);
+    }
+    const double by_x = slope[0] + v * (slope[1] + v * (slope[2] + v * slope[3]));
+    const double by_y = r[1] + v * (2 * r[2] + v * 3 * r[3]);
+    return (struct height){.z = r[0] + v * (r[1] + v * (r[2] + v * r[3])),
+                           .by_x = out_x ? 0 : by_x / g->step_x,
+                           .by_y = out_y ? 0 : by_y / g->step_y};
 }
 
 // ---------------------------------------------------------------------------------------------------- fade
@@ -72,11 +90,13 @@ static double fade_at(const struct step_surface *g, double z, double *by_z) {
     return (g->fade_to - z) / (g->fade_to - g->fade_from);
 }
 
-void step_surface_add(const struct surface *s, double *at, double *v) {
+void step_surface_add(const struct surface *s, double *at, double *v, double slope[2]) {
     const struct step_surface *g = &s->grid;
     const struct height h = height_at(g, at[AXIS_X], at[AXIS_Y]);
     double by_z;
     const double fade = fade_at(g, at[AXIS_Z], &by_z), over = h.z - g->fade_target;
+    if (slope)
+        slope[0] = fade * h.by_x, slope[1] = fade * h.by_y;
     at[AXIS_Z] += g->fade_target + fade * over;
     v[AXIS_Z] += fade * (h.by_x * v[AXIS_X] + h.by_y * v[AXIS_Y]) + by_z * v[AXIS_Z] * over;
 }
@@ -206,6 +226,11 @@ bool step_surface_is_smooth(const struct surface *s, double x0, double x1, doubl
 
 double step_surface_change(const struct surface *s, const double far[3]) {
     return s->slope_x * far[AXIS_X] + s->slope_y * far[AXIS_Y] + STEEPEST * far[AXIS_Z];
+}
+
+double step_surface_curl(const struct surface *s, const double far[3]) {
+    const double x = far[AXIS_X], y = far[AXIS_Y];
+    return 0.5 * (s->bend_xx * x * x + 2 * s->bend_xy * x * y + s->bend_yy * y * y);
 }
 
 double step_surface_bend(const struct surface *s, double vx, double vy, double ax, double ay) {

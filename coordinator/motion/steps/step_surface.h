@@ -22,15 +22,20 @@ struct surface {
 
 void step_surface_set(struct surface *surface, const struct step_surface *grid);
 
-// Moves AT from the planned place to the one that the motors go to, and V, its speeds, likewise.
-void step_surface_add(const struct surface *surface, double *at, double *v);
+// Moves AT from the planned place to the one that the motors go to, and V, its speeds, likewise. SLOPE (or
+// NULL): how fast what is added changes by X and by Y there.
+void step_surface_add(const struct surface *surface, double *at, double *v, double slope[2]);
 
 // Whether heights inside X0..X1, Y0..Y1 and Z0..Z1 (planned) are smooth: inside the grid, and fade constant.
 bool step_surface_is_smooth(const struct surface *surface, double x0, double x1, double y0, double y1,
                             double z0, double z1);
 
-// The bound of how the height changes when X, Y and Z change by FAR, mm.
+// The bound of how the height changes when X, Y and Z change by up to FAR, mm, wherever that is.
 double step_surface_change(const struct surface *surface, const double far[3]);
+
+// By how much more than by its slope the height can change when X and Y change by up to FAR where it is
+// smooth.
+double step_surface_curl(const struct surface *surface, const double far[3]);
 
 // The bound of the second derivative of the height by time, mm/s², for speeds and accelerations of X and Y.
 double step_surface_bend(const struct surface *surface, double vx, double vy, double ax, double ay);

@@ -92,11 +92,14 @@ struct step_correction {
 
 // The shape of a bed: see step_surface.h. Nodes in rows of X: height (mm), its slopes by X and by Y (mm/mm),
 // its twist (by both, 1/mm). FADE_FROM and FADE_TO are the infinite where nothing fades.
+// Patches, each between four nodes, in rows of X: the height as powers of U and V, the share of the way
+// across the patch along X and Y; coefficient 4·i + j is of U^i·V^j. step_surface_make_patches writes them.
 struct step_surface {
     int32_t points_x, points_y;            // 2..STEP_SURFACE_POINTS; points_x 0: no surface
     double from_x, from_y, step_x, step_y; // mm
     double fade_from, fade_to, fade_target;
-    const double *nodes; // 4 values each; must stay there until another surface is set
+    const double *nodes;   // 4 values each; must stay there until another surface is set
+    const double *patches; // 16 values each; likewise
 };
 
 // What went wrong, for the sentence the user reads. Fields that do not apply are -1 or 0.
@@ -135,6 +138,9 @@ size_t step_gen_size(const struct step_config *config);
 
 // Whether SURFACE can be a bed: counts and lengths in range, slopes and fading not steeper than 1/2.
 bool step_surface_is_legal(const struct step_surface *surface);
+
+// Writes the patches of a legal SURFACE: (points_x - 1)·(points_y - 1) times 16 values.
+void step_surface_make_patches(const struct step_surface *surface, double *patches);
 
 // The slope that SURFACE has nowhere more of, mm/mm.
 double step_surface_steepest(const struct step_surface *surface);

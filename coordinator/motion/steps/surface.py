@@ -50,6 +50,10 @@ class Surface:
                 " at least 0.1 mm apart, whose height nowhere changes by more than 0.5 mm per mm, also where"
                 " it fades; probe the bed again, or let it fade over more height"
             )
+        rows, columns = self.nodes.shape[:2]
+        self._patches: Any = ffi.new("double[]", 16 * (rows - 1) * (columns - 1))
+        lib.step_surface_make_patches(self.grid, self._patches)
+        self.grid.patches = self._patches
 
     @property
     def steepest(self) -> float:

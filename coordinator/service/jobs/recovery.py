@@ -15,6 +15,7 @@ from coordinator.gcode.commands import Recovering
 from coordinator.gcode.events import Event, Full, Notice
 from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.modules.levelling.bed_mesh import RESTORE, BedMesh
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
@@ -171,6 +172,7 @@ class Recovery:
             "speed_factor": motion.planned.speed_factor,
             "extrude_factor": motion.planned.extrude_factor,
             **_hot(machine.modules),
+            **_mesh(machine.modules, motion),
         }
 
     def _show(self, found: Interrupted | None) -> None:
@@ -198,7 +200,9 @@ class Recovery:
                 await self._do(found, TakeHeight((), "recover", z_mm=way.z_mm))
             if way.up_mm is not None and way.up_mm > motion.planned.position[2]:
                 await self._do(found, MoveWork({"Z": way.up_mm}, LIFT_MM_S, relative=False, name="recover"))
-            await self._do(found, LinesWork([*way.homing, *work.reached.lines, *blown, "M400"], "recover"))
+            mesh = self._mesh_lines(found)
+            lines = [*way.homing, *work.reached.lines, *mesh, *blown, "M400"]
+            await self._do(found, LinesWork(lines, "recover"))
             for name, variables in work.reached.variables.items():
                 macro = service.up_machine().modules.find(name, GCodeMacro)
                 if macro is not None:
@@ -243,9 +247,22 @@ class Recovery:
         self, how: Recovering, found: Interrupted, motion: Motion, part_mm: float
     ) -> ResumeHomingPlan:
         z_mm = sure_height(found.held.get("z")) if how.z_mm is None else how.z_mm
+        if z_mm is not None and how.z_mm is None and isinstance(bed_mm := found.held.get("bed_mm"), float):
+            z_mm += bed_mm
         machine = self._service.up_machine()
         homed, part_mm = motion.planned.homed, max(part_mm, z_mm or 0.0)
         return plan_resume_homing(machine.description, machine.modules, homed, part_mm=part_mm, z_mm=z_mm)
+
+    def _mesh_lines(self, found: Interrupted) -> list[str]:
+        """Return the line that has Z follow the mesh that it followed, once all is homed."""
+        mesh = next(self._service.up_machine().modules.of(BedMesh), None)
+        held = found.held.get("mesh")
+        if not isinstance(held, dict):
+            return []
+        if mesh is None:
+            raise ApiError("not_ready", f"{found.file} was printed with a mesh, and there is no [bed_mesh]")
+        mesh.to_restore = held
+        return [RESTORE]
 
     def _heating(self, found: Interrupted) -> tuple[list[str], list[str]]:
         """Return the lines that make hot what was hot, extruders last, and those of fans; raises ApiError."""
@@ -284,6 +301,16 @@ class Recovery:
             unless_done.pop_all()
         objects = next(self._service.up_machine().modules.of(ExcludeObject), None)
         return RecoverWork(program, line=line, reached=reached, held=found.held, objects=objects)
+
+
+def _mesh(modules: Modules, motion: Motion) -> Mapping[str, Any]:
+    """Return the mesh that Z follows, and how much higher the head stands for it."""
+    mesh = next(modules.of(BedMesh), None)
+    held = None if mesh is None else mesh.held()
+    if mesh is None or held is None:
+        return {}
+    x, y, z, _ = (motion.trace.at(motion.now_s) or motion.planned).position
+    return {"mesh": held, "bed_mm": mesh.added_mm((x, y, z))}
 
 
 def _hot(modules: "Modules") -> Mapping[str, Any]:

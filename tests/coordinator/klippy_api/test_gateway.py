@@ -30,6 +30,22 @@ gcode:
     GET_POSITION
     { action_call_remote_method("shutdown_machine", delay=3) }
     { action_call_remote_method("nobody_has_it") }
+[bed_mesh]
+mesh_min: 20, 30
+mesh_max: 120, 90
+probe_count: 4, 3
+[bed_mesh bent]
+version: 1
+points:
+  0, 0.1, 0
+  0.05, 0, 0
+  0, 0, 0
+x_count: 3
+y_count: 3
+min_x: 20
+max_x: 120
+min_y: 30
+max_y: 90
 [gcode_macro QUIET]
 gcode:
     M117 quiet
@@ -74,6 +90,7 @@ def test_what_moonraker_and_a_browser_ask_for(tmp_path: Path) -> None:
             objects = await as_moonraker(client)
             await _check_objects(client, objects)
             await _check_motion(client)
+            await _check_mesh(client)
             await _check_outputs(client)
             await _check_print(client, served, printer)
             await _check_stop_and_restart(api, client, served)
@@ -133,6 +150,27 @@ async def _check_motion(client: KlippyClient) -> None:
     assert set(ends) == {"x", "y", "z"}
     assert set(ends.values()) <= {"open", "TRIGGERED"}
     assert set((await client.query("query_endstops"))["query_endstops"]["last_query"].values()) <= {0, 1}
+
+
+async def _check_mesh(client: KlippyClient) -> None:
+    found = await client.ask("bed_mesh/dump_mesh")
+    assert found["current_mesh"] == {}
+    assert found["profiles"]["bent"]["points"] == [[0, 0.1, 0], [0.05, 0, 0], [0, 0, 0]]
+    planned = found["calibration"]
+    assert planned["points"][1] == [pytest.approx(160 / 3), 30]
+    assert planned["probe_path"][3:5] == [[120, 30], [120, 60]]
+    assert (planned["config"]["x_count"], planned["config"]["y_count"]) == (4, 3)
+    assert len(found["axis_maximum"]) == len(found["axis_minimum"]) == 4
+    await client.ask("gcode/script", {"script": "BED_MESH_PROFILE LOAD=bent"})
+    other = {"mesh_args": {"probe_count": "3, 3", "MESH_MAX": "100,90"}}
+    found = await client.ask("bed_mesh/dump_mesh", other)
+    assert found["current_mesh"]["name"] == "bent"
+    assert found["current_mesh"]["mesh_params"]["max_x"] == 120
+    assert len(found["current_mesh"]["mesh_matrix"]) > 2
+    assert found["calibration"]["points"][2] == [100, 30]
+    bad = {"mesh_args": {"mesh_max": "1,1"}}
+    assert "MESH_MAX is not beyond" in await client.error("bed_mesh/dump_mesh", bad)
+    await client.ask("gcode/script", {"script": "BED_MESH_CLEAR"})
 
 
 async def _check_outputs(client: KlippyClient) -> None:

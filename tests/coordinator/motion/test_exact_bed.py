@@ -6,105 +6,49 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps.errors import StepError
-from coordinator.motion.steps.steps import MAX_ERROR_S, StepGenerator
-from coordinator.motion.steps.surface import NO_FADE, Surface
+from coordinator.motion.steps.shapers import shaper_impulses
+from coordinator.motion.steps.steps import StepGenerator
+from coordinator.motion.steps.surface import Surface
 from coordinator.verification.exact_bed import ExactBed
-from coordinator.verification.exact_path import Leg, Setting
-from tests.coordinator.motion.exact_cases import AWAY, PARAMS, SETTING, chain, spec_of, trapezoids
-from tests.coordinator.motion.exact_check import StepperProof, check
-from tests.coordinator.motion.replay import Stream, replay
+from coordinator.verification.exact_path import Setting
+from tests.coordinator.motion.bed_cases import WITH_Z, SomeBed, across, bed, judge, over_bed, z_spec
+from tests.coordinator.motion.exact_cases import AWAY, SETTING, spec_of
 from tests.coordinator.motion.steps_harness import node_spec, stepper
-from tests.coordinator.motion.steps_oracle import make_move
+from tests.profiles import examples
 
-MOVES = 150
-CUT_S = 0.37
-WITH_Z = [kind for kind in PARAMS if not kind.startswith("polar")]
 SETTINGS = {"plain": Setting(), "shaped": SETTING}
-
-
-def bed(seed: int, fade: tuple[float, float, float] = NO_FADE, *, spacing_mm: float = 7.0) -> Surface:
-    """Return a bed around AWAY, smaller than what the moves reach."""
-    rng = np.random.default_rng(seed)
-    sizes = (0.015 * spacing_mm, 0.01, 0.01, 0.007 / spacing_mm)
-    nodes = np.stack([rng.normal(0, size, (4, 5)) for size in sizes], axis=-1)
-    return Surface((AWAY[0] - 14, AWAY[1] - 9), (spacing_mm, spacing_mm * 0.8), nodes, fade)
-
-
-def over_bed(seed: int, *, lift: bool = False) -> Any:
-    """Return moves over the bed; with LIFT, Z too goes up and down."""
-    moves = trapezoids(chain(seed, MOVES))
-    moves["start"] += AWAY
-    if lift:
-        z = AWAY[2]
-        rng = np.random.default_rng(seed)
-        for move in moves:
-            way = (
-                (move["start_v"] + 0.5 * move["accel"] * move["accel_s"]) * move["accel_s"]
-                + move["cruise_v"] * move["cruise_s"]
-                + (move["cruise_v"] - 0.5 * move["accel"] * move["decel_s"]) * move["decel_s"]
-            )
-            move["start"][2] = z
-            move["ratio"][2] = rng.choice([0.0, 0.1, -0.1])
-            z += move["ratio"][2] * way
-    return moves
-
-
-def across(seed: int, count: int = 40) -> Any:
-    """Return long moves from rest to rest inside the bed: Z turns several times in a cruise."""
-    rng = np.random.default_rng(seed)
-    moves, t, at = [], 1.0, AWAY
-    for _ in range(count):
-        end = (AWAY[0] + rng.uniform(-14, 14), AWAY[1] + rng.uniform(-9, 7.8), AWAY[2], 0.0)
-        moves.append(make_move(t, at, end, (0.0, float(rng.uniform(50, 400)), 0.0), 8000.0))
-        t, at = t + moves[-1].total_s + rng.choice([0.0, 0.01, 0.3]), end
-    return trapezoids(moves)
-
-
-def generated(spec: StepperSpec, moves: Any, setting: Setting, surface: Surface) -> Stream:
-    node = node_spec(move_count=4096)
-    x, y, z = (float(v) for v in AWAY[:3])
-    bed_z = float(ExactBed(surface).motor_z(np.array([x]), np.array([y]), np.array([z]))[0])
-    gen: Any = StepGenerator([spec], [node], start=(x, y, bed_z, 0.0))
-    for axis, impulses in setting.shapers.items():
-        gen.set_shaper("XYZ".index(axis), impulses)
-    assert gen.set_surface(surface) == pytest.approx(z, abs=1e-12)
-    assert gen.append(moves, len(moves)) == len(moves)
-    end = float(moves[-1]["print_time"]) + 1.0
-    batch = bytearray()
-    for until in [*np.arange(1.0, end - 0.5, CUT_S), end]:
-        done = False
-        while not done:
-            done = gen.generate(float(until), flush=until == end)
-            while piece := gen.take_batch(0):
-                batch += piece
-    return replay(bytes(batch), node, [spec])[spec.name]
-
-
-def judge(spec: StepperSpec, moves: Any, setting: Setting, surface: Surface) -> int:
-    """Compare every step; return how many there are."""
-    stream = generated(spec, moves, setting, surface)
-    exact = replace(setting, bed=ExactBed(surface))
-    verdict = check(
-        StepperProof([Leg(spec, AWAY, moves, exact)]), stream, node_spec().clock_freq, MAX_ERROR_S
-    )
-    assert verdict.checked == verdict.emitted
-    assert verdict.outside == 0, f"at {verdict.outside_s} s"
-    assert verdict.position == verdict.wanted_position
-    assert verdict.wanted - verdict.emitted in range(0, 4 * MOVES, 2)
-    return verdict.emitted
 
 
 @pytest.mark.parametrize("kind", ["z", "corexz", *WITH_Z])
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_every_step_over_a_bed(kind: str, setting: str) -> None:
-    spec = stepper(0, (1.0, 0.0, 1.0, 0.0), 0.00625) if kind == "corexz" else spec_of(kind)
-    if kind == "z":
-        spec = replace(spec, step_distance=0.0005)
+    spec = z_spec(kind, 0.0005 if kind == "z" else 0.00625)
     chosen = replace(SETTINGS[setting], smooth_s=0.0)
     assert judge(spec, over_bed(3), chosen, bed(7)) > 500
+
+
+BEDS = st.builds(
+    SomeBed,
+    seed=st.integers(0, 2**32 - 1),
+    slope=st.floats(-4, -1.9).map(lambda power: 10**power),
+    spacing_mm=st.floats(3, 60),
+    counts=st.tuples(st.integers(2, 7), st.integers(2, 7)),
+    fades=st.booleans(),
+)
+SHAPERS = st.sampled_from((None, "zv", "mzv", "ei", "3hump_ei"))
+
+
+@settings(max_examples=examples(8))
+@given(some=BEDS, kind=st.sampled_from(("z", "z", "z", *WITH_Z)), shaper=SHAPERS, lift=st.booleans())
+def test_every_step_over_any_bed(some: SomeBed, kind: str, shaper: str | None, *, lift: bool) -> None:
+    """Also over nearly flat ones, where whole moves are passed without a look at each of their phases."""
+    found = {} if shaper is None else {axis: shaper_impulses(shaper, 45.0, 0.1) for axis in "XY"}
+    moves = over_bed(some.seed, lift=lift, count=60)
+    judge(z_spec(kind, 0.0025), moves, Setting(found, 0.0), some.surface())
 
 
 @pytest.mark.parametrize("seed", [1, 2])
