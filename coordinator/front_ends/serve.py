@@ -137,6 +137,7 @@ class _ServiceProcess:
             cache=self._cache,
             on_line=lambda entry: self._on_entry(service, entry),
         )
+        service.claim_folder()  # before uploads are removed that may be those of another service
         add_methods(service, registry)
         if settings.jobs is not None:
             registry.add(upload_method(settings.jobs))

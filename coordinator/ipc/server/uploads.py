@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import os
 import shutil
 import stat
@@ -24,6 +25,8 @@ FREE_MIN: Final = 256 * 2**20
 SUFFIXES: Final = (".gcode", ".gco", ".g", ".nc", ".ngc")
 _FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 _PARTIAL: Final = ".part"
+_NO_LINKS: Final = (errno.EPERM, errno.ENOTSUP, errno.EMLINK)
+"""Of a disk without hard links."""
 
 
 def upload_method(folder: Path) -> Method:
@@ -73,8 +76,8 @@ class _Uploads:
         try:
             size = await asyncio.to_thread(_write, self._folder, params, part)
         except (OSError, ApiError) as error:
-            if offset == 0 or isinstance(error, _FullError):
-                await self._drop(name, part)
+            if offset == 0 or isinstance(error, _FullError | OSError):
+                await self._drop(name, part)  # what a failed call left of it is not known
             if isinstance(error, ApiError):
                 raise
             raise ApiError("failed", f"{shown(name)} cannot be written: {error.strerror or error}") from None
@@ -168,7 +171,7 @@ def _write(folder: Path, params: dict[str, Any], part: _Part) -> int:
 def _write_into(directory: int, params: dict[str, Any], part: _Part) -> int:
     name, offset, data = params["file"], params["offset"], params["text"].encode()
     if not params["replace"] and _exists(name, directory):
-        raise ApiError("file_exists", f"{shown(name)} exists already; choose another name, or set replace")
+        raise _exists_error(name)
     if (free := shutil.disk_usage(directory).free) - len(data) < FREE_MIN:
         raise _FullError(free)
     partial = _partial_of(name)
@@ -177,11 +180,33 @@ def _write_into(directory: int, params: dict[str, Any], part: _Part) -> int:
         size = _append(out, name, offset, data)
         if params["done"]:
             os.fsync(out)
-            os.rename(partial, name, src_dir_fd=directory, dst_dir_fd=directory)
+            _show(directory, partial, name, replace=params["replace"])
             part.gone = True
+            os.fsync(directory)
     finally:
         os.close(out)
     return size
+
+
+def _show(directory: int, partial: str, name: str, *, replace: bool) -> None:
+    """Give the file PARTIAL its NAME; raises ApiError where that exists by now, unless REPLACE."""
+    folders = {"src_dir_fd": directory, "dst_dir_fd": directory}
+    if not replace:
+        try:
+            os.link(partial, name, **folders, follow_symlinks=False)
+        except FileExistsError:
+            raise _exists_error(name) from None
+        except OSError as error:
+            if error.errno not in _NO_LINKS:
+                raise
+        else:
+            os.unlink(partial, dir_fd=directory)
+            return
+    os.rename(partial, name, **folders)  # noqa: PTH104 (in an open folder)
+
+
+def _exists_error(name: str) -> ApiError:
+    return ApiError("file_exists", f"{shown(name)} exists already; choose another name, or set replace")
 
 
 def _append(out: int, name: str, offset: int, data: bytes) -> int:

@@ -1,15 +1,15 @@
 """The job folder: the only files that clients can have printed, whatever names they send."""
 
 import contextlib
+import fcntl
 import os
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
-from io import FileIO
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-from coordinator.gcode.program import Program
+from coordinator.gcode.program import Program, UnchangedFile
 from nodes.support.errors import CanductorError
 
 DEPTH_MAX: Final = 8
@@ -33,6 +33,40 @@ class JobFile:
     size_bytes: int
     modified_s: float
     """Since the epoch."""
+
+
+class JobFolderInUse(CanductorError):  # noqa: N818
+    """Another service has the job folder."""
+
+
+class JobFolderClaim:
+    """Makes the job folder PATH this service's until ``close``; raises JobFolderInUse.
+
+    Two services would remove each other's uploads and overwrite each other's journal. The kernel
+    ends the lock with the process, however that ends. A disk without locks, or no folder, is no reason to refuse.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._fd: int | None = None
+        with contextlib.suppress(OSError):
+            self._fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        if self._fd is None:
+            return
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.close()
+            raise JobFolderInUse(
+                f"the job folder {path} is used by another service; end that one, or use another folder"
+            ) from None
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        """Let others have it."""
+        fd, self._fd = self._fd, None
+        if fd is not None:
+            os.close(fd)
 
 
 class JobFolder:
@@ -76,11 +110,13 @@ class JobFolder:
                 raise NoSuchJob(
                     f"there is no file {_shown(name)} in the job folder; job.list returns those that exist"
                 ) from None
-        status = os.fstat(fd)
-        if not stat.S_ISREG(status.st_mode):
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
             raise NoSuchJob(f"{_shown(name)} in the job folder is not a file")
-        return Program(FileIO(fd), "/".join(parts), size_bytes=status.st_size, modified_ns=status.st_mtime_ns)
+        clean = "/".join(parts)
+        source = UnchangedFile(fd, clean)
+        status = source.status
+        return Program(source, clean, size_bytes=status.st_size, modified_ns=status.st_mtime_ns)
 
 
 def _parts(name: str) -> tuple[str, ...]:
