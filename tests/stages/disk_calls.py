@@ -1,7 +1,7 @@
 """What a disk may hold after a power cut, from a record of the calls that changed a folder (disk_calls.c).
 
 A power cut may keep all that was done, or only what fsync brought to the disk, or much in between: names
-without the content of their files, content without names, a part of the last write. ``crash_states`` yields them.
+without the content of their files, content without names, a part of the last write.
 Changes of names reach the disk in their order, as on every disk with a journal.
 """
 

@@ -42,8 +42,8 @@ class JobFolderInUse(CanductorError):  # noqa: N818
 class JobFolderClaim:
     """Makes the job folder PATH this service's until ``close``; raises JobFolderInUse.
 
-    Two services would remove each other's uploads and overwrite each other's journal. The kernel
-    ends the lock with the process, however that ends. A disk without locks, or no folder, is no reason to refuse.
+    Two services would remove each other's uploads and overwrite each other's journal. The lock ends with the
+    process, however that ends. A disk without locks, or no folder, is no reason to refuse.
     """
 
     def __init__(self, path: Path) -> None:
