@@ -41,6 +41,7 @@ from coordinator.web.settings import WebSettings
 from nodes.dictionary.cache import DictionaryCache
 from nodes.support.host_sockets import socket_folder
 from nodes.support.state_folder import state_folder
+from nodes.support.terminal import show
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -288,5 +289,4 @@ def _address(options: ServeOptions, port: int | None) -> str:
 
 
 def _print(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+    show(line)

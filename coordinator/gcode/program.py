@@ -40,7 +40,7 @@ class UnchangedFile(FileIO):
         self._shown = name
         self.status = os.fstat(self.fileno())
 
-    def read(self, size: int | None = -1, /) -> bytes | None:
+    def read(self, size: int | None = -1, /) -> bytes | None:  # type: ignore[override]  # as FileIO does
         """Return what follows; raises CanductorError once the file was changed, OSError."""
         piece = super().read(size)
         now = os.fstat(self.fileno())

@@ -12,17 +12,17 @@ from threading import Lock
 from typing import Any, Final
 
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
+from coordinator.support.job_names import NAME_BYTES_MAX, RULE, SUFFIXES, is_job_name
 from coordinator.support.values import Value
 
 PART_MAX: Final = 32_768
 """Characters of one part; however they are written, a message holds them."""
 SIZE_MAX: Final = 2**31
-NAME_MAX: Final = 128
 PARTS_MAX: Final = 4
 """Files of one client that are not complete."""
 FREE_MIN: Final = 256 * 2**20
 """Bytes of the disk that stay free: the journal and the logs need some."""
-SUFFIXES: Final = (".gcode", ".gco", ".g", ".nc", ".ngc")
+_ENDS: Final = ", ".join(SUFFIXES)
 _FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 _PARTIAL: Final = ".part"
 _NO_LINKS: Final = (errno.EPERM, errno.ENOTSUP, errno.EMLINK)
@@ -39,7 +39,12 @@ def upload_method(folder: Path) -> Method:
         "Write a part of a file for the job folder; the file appears with its last part.",
         uploads.upload,
         (
-            Param("file", Kind.STR, f"a plain name that ends in one of {', '.join(SUFFIXES)}", high=NAME_MAX),
+            Param(
+                "file",
+                Kind.STR,
+                f"a plain name that ends in one of {', '.join(SUFFIXES)}",
+                high=NAME_BYTES_MAX,
+            ),
             Param("offset", Kind.INT, "bytes sent before; 0 starts over", "bytes", low=0, high=SIZE_MAX),
             Param("text", Kind.STR, "the text at that offset", high=PART_MAX),
             Param("done", Kind.BOOL, "this is the last part", required=False, default=False),
@@ -147,7 +152,7 @@ def _remove_left(folder: Path) -> None:
     with contextlib.suppress(OSError):  # who writes there says what is wrong
         for path in list(folder.iterdir()):
             name = path.name.removeprefix(".").removesuffix(_PARTIAL)
-            if path.name == _partial_of(name) and name.lower().endswith(SUFFIXES):
+            if path.name == _partial_of(name) and is_job_name(name):
                 _unlink(path)
 
 
@@ -234,8 +239,5 @@ def _exists(name: str, directory: int) -> bool:
 
 
 def _check_name(name: str) -> None:
-    plain = name.isprintable() and "/" not in name and not name.startswith((".", "-"))
-    if not plain or not name.lower().endswith(SUFFIXES):
-        raise ApiError(
-            "bad_params", f"{shown(name)} must be a plain name that ends in one of {', '.join(SUFFIXES)}"
-        )
+    if not is_job_name(name):
+        raise ApiError("bad_params", f"{shown(name)} must be {RULE}")

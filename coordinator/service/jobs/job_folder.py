@@ -6,18 +6,16 @@ import os
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Final
 
 from coordinator.gcode.program import Program, UnchangedFile
+from coordinator.support.job_names import DEPTH_MAX, is_job_name, is_plain_part, job_path_parts
 from nodes.support.errors import CanductorError
 
-DEPTH_MAX: Final = 8
 FILES_MAX: Final = 10_000
 """Looked at for one list."""
-NAME_BYTES_MAX: Final = 1024
 _NO_LINK: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
-SUFFIXES: Final = (".gcode", ".gco", ".g", ".nc", ".ngc")
 
 
 class NoSuchJob(CanductorError):  # noqa: N818
@@ -121,16 +119,8 @@ class JobFolder:
 
 def _parts(name: str) -> tuple[str, ...]:
     """Return the parts of a clean relative path; raises NoSuchJob for any other."""
-    parts = PurePosixPath(name).parts
-    odd = (
-        not parts
-        or len(parts) > DEPTH_MAX
-        or len(name.encode(errors="surrogatepass")) > NAME_BYTES_MAX
-        or not name.isprintable()
-        or "\\" in name
-        or any(part in ("..", "/", "//") or part.startswith(".") for part in parts)
-    )
-    if odd:
+    parts = job_path_parts(name)
+    if not parts:
         raise NoSuchJob(
             f"{_shown(name)} is not the name of a job; use the name of a file as job.list returns it"
         )
@@ -150,13 +140,13 @@ def _walk(root: int) -> Iterator[tuple[str, list[str], int]]:
     for folder, folders, names, fd in os.fwalk(".", dir_fd=root, follow_symlinks=False):
         clean = folder[2:] if folder.startswith("./") else ""
         depth = clean.count("/") + 1 if clean else 0
-        folders[:] = [] if depth >= DEPTH_MAX - 1 else [f for f in folders if not f.startswith(".")]
+        folders[:] = [] if depth >= DEPTH_MAX - 1 else list(filter(is_plain_part, folders))
         yield clean, names, fd
 
 
 def _jobs_of(folder: str, names: list[str], fd: int) -> Iterator[JobFile]:
     for name in names:
-        if name.startswith(".") or not name.lower().endswith(SUFFIXES) or not name.isprintable():
+        if not is_job_name(name):
             continue
         try:
             status = os.stat(name, dir_fd=fd, follow_symlinks=False)

@@ -74,15 +74,14 @@ def _interrupted(head: Mapping[str, Any], last: Mapping[str, Any]) -> Interrupte
 
     The file is in a folder that others may write to.
     """
+    file = head.get("file")
     numbers = [head.get("size"), head.get("modified_ns"), last.get("line")]
-    if head.get("journal") != _VERSION or not isinstance(head.get("file"), str):
+    size, modified_ns, line = (n if type(n) is int and n < _INT_END else -1 for n in numbers)
+    if head.get("journal") != _VERSION or not isinstance(file, str) or min(size, modified_ns) < 0:
         return None
-    if not all(type(number) is int and 0 <= number < _INT_END for number in numbers):
+    if line < 1 or not _is_sound(last):
         return None
-    if last["line"] < 1 or not _is_sound(last):
-        return None
-    size, modified_ns, line = numbers
-    return Interrupted(head["file"], size, modified_ns, line, last, fed=head.get("fed") is True)
+    return Interrupted(file, size, modified_ns, line, last, fed=head.get("fed") is True)
 
 
 def _is_sound(held: Mapping[str, Any]) -> bool:
