@@ -23,6 +23,8 @@ EVERY: Final = 97
 POINTS_MIN: Final = 2000
 """Power cuts and faults, of all writers together, in profile ``full``; half of them in ``ci``."""
 
+pytestmark = pytest.mark.timeout(1800)  # of the writers, all points of profile ``full`` together
+
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
