@@ -11,7 +11,7 @@ HAZARDS = ("## Heat and fire", "## Motion and pinching")
 
 
 def named_tests(page: str) -> list[tuple[str, str]]:
-    return [match.groups(default="") for match in NAMED.finditer((ROOT / "docs" / page).read_text())]
+    return [(match[1], match[2] or "") for match in NAMED.finditer((ROOT / "docs" / page).read_text())]
 
 
 @pytest.mark.parametrize("page", ["safety.md", "security.md"])

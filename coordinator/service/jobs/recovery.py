@@ -107,7 +107,15 @@ class Recovery:
             return
         path = folder.path / NAME
         self._show(read_journal(path))
-        self._journal = Journal(path, lambda text: self._service.log.add("notice", text))
+        loop = asyncio.get_running_loop()
+
+        def report(
+            text: str,
+        ) -> None:  # in the journal's thread: no place for the log's listeners
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self._service.log.add, "notice", text)
+
+        self._journal = Journal(path, report)
         if (found := self.interrupted) is not None:
             what_next = (
                 "its lines came from a client, which has to begin it again"
