@@ -18,7 +18,7 @@ from tests.stages import disk_calls
 from tests.stages.disk_calls import CrashState, crash_states, end_state, read_record
 from tests.stages.disk_worker import ALL, HALF, KILL, KILL_TORN, RESULTS, WRITERS, CarelessWriter
 
-EVERY: Final = 97
+EVERY: Final = 211
 """Of the faults tried in profile ``ci``; a prime, so that all calls and kinds of faults have their turn."""
 POINTS_MIN: Final = 2000
 """Power cuts and faults, of all writers together, in profile ``full``; half of them in ``ci``."""
