@@ -6,7 +6,6 @@ too; the code that follows them is in PARTS. The result is one self-contained fi
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -24,6 +23,7 @@ from nodes.dictionary.parts import OutputFormat
 from nodes.support.can_protocol import DATA_NODEID_MAX, FIRST_DATA_ID
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import Assignments, UsageError, parse_int
+from nodes.support.terminal import show
 
 WIDTHS: Final = {"%u": 32, "%i": 32, "%hu": 16, "%hi": 16, "%c": 8}
 """Bits of a number with this code."""
@@ -82,7 +82,7 @@ def write_dissector(output: Path | None, files: Mapping[int | str, Path]) -> "Di
     dictionaries = {key: read_dictionary(path) for key, path in files.items()}
     text = dissector(dictionaries)
     if output is None:
-        sys.stdout.write(text)
+        show(text, end="")
     else:
         try:
             output.write_text(text, encoding="utf-8")

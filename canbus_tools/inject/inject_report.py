@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final, TextIO
 
 from canbus_tools.support.text_table import table
+from nodes.support.terminal import show
 from nodes.virtual.hub import BusStats, ClientStats, VirtualBus
 
 _DAMAGE: Final = {
@@ -26,6 +27,9 @@ _DAMAGE: Final = {
 """Counters of BusStats that are shown if they are not 0."""
 
 
+CLEAR_LINE: Final = "\r\x1b[K"
+
+
 class StatusLine:
     """A line on a terminal that is updated in place."""
 
@@ -43,14 +47,12 @@ class StatusLine:
         if socketcand_clients:
             text += f"  socketcand {socketcand_clients}"
         width = shutil.get_terminal_size().columns - 1  # a wrapped line could not be overwritten
-        self._stream.write(f"\r\x1b[K{text[:width]}")
-        self._stream.flush()
+        show(text[:width], self._stream, before=CLEAR_LINE, end="")
         self._last_s, self._before = now_s, stats
 
     def clear(self) -> None:
         """Clear the line for further output."""
-        self._stream.write("\r\x1b[K")
-        self._stream.flush()
+        show("", self._stream, before=CLEAR_LINE, end="")
 
 
 def status(before: BusStats, now: BusStats, passed_s: float, ran_s: float) -> str:

@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Iterable
-from functools import lru_cache
 
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.protocol import Direction
 from canbus_tools.protocol.traffic import NodeTraffic
 from canbus_tools.support.text_table import table
+from nodes.support.terminal import printable
 
 _ENDS = {Direction.TO_NODE: "to", Direction.FROM_NODE: "from", Direction.ANY: "from"}
 _NOBODY = {Direction.TO_NODE: "to all", Direction.FROM_NODE: "from ?", Direction.ANY: "-"}
@@ -22,13 +22,12 @@ def line_of(said: Decoded) -> str:
     """Return a line with time, bus, receiver or sender and the text, without the line's end."""
     time_s, channel, nodeid, direction, _, _, repeated, shape, values = said
     again = "  (repeated)" if repeated else ""
-    return f"{time_s:.6f}  {printable(channel)}  {_WORDS[nodeid, direction]}  {shape.text(values)}{again}"
+    return f"{time_s:.6f}  {name_of(channel)}  {_WORDS[nodeid, direction]}  {shape.text(values)}{again}"
 
 
-@lru_cache(maxsize=256)
-def printable(name: str) -> str:
-    """Return a bus's name without what a terminal would obey: recordings come from anywhere."""
-    return "".join(c if c.isprintable() else "?" for c in name) or "-"
+def name_of(text: str) -> str:
+    """Return the name TEXT of a bus or chip for people, - for none; recordings come from anywhere."""
+    return printable(text) or "-"
 
 
 _HEADINGS = ("node", "uuid", "mcu", "frames", "to", "from", "repeated", "missed", "naks", "invalid", "unread")
@@ -42,7 +41,7 @@ def table_of(nodes: Iterable[NodeTraffic]) -> str:
         cells = (
             node.nodeid,
             node.uuid or "-",
-            printable(node.mcu),
+            name_of(node.mcu),
             sum(way.frames for way in ways),
             *(way.messages for way in ways),
             node.flow.repeated_blocks,

@@ -18,6 +18,7 @@ from canbus_tools.discovery.inventory import take_inventory
 from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, integer, options_from, parse_int
+from nodes.support.terminal import show
 from nodes.transport import BAUD_DEFAULT
 
 NODEID_MAX = 255
@@ -173,8 +174,7 @@ def _lines(options: ConsoleOptions) -> Iterator[tuple[str, str]]:
 
 
 def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    show(text)
 
 
 def _history_file() -> Path:

@@ -15,13 +15,14 @@ from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries
 from canbus_tools.protocol.filters import Filter, declare_filter, given_filter, read_filter
 from canbus_tools.protocol.frame import Frame
-from canbus_tools.protocol.lines import line_of, printable, table_of
+from canbus_tools.protocol.lines import line_of, name_of, table_of
 from canbus_tools.recordings.mcap_file import json_line
 from canbus_tools.recordings.recordings import STANDARD_INPUT, read_batches
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file
+from nodes.support.terminal import show, show_error
 
 LINES_HELD: Final = 500
 """Lines written at once."""
@@ -201,8 +202,7 @@ class Decoding:
         if not self._held:
             return
         self.shown += len(self._held)
-        sys.stdout.write("\n".join(self._held) + "\n")
-        sys.stdout.flush()
+        show("\n".join(self._held))
         self._held.clear()
 
 
@@ -249,7 +249,7 @@ class DecodeReport:
         for name, bus in self._decoding.buses.items():
             table = table_of(bus.nodes[nodeid] for nodeid in sorted(bus.nodes))
             others = f"{bus.other_frames} frames of other protocols, {bus.error_frames} error frames"
-            parts.append(f"\nbus {printable(name)}: {others}\n{table}")
+            parts.append(f"\nbus {name_of(name)}: {others}\n{table}")
         return "\n".join(parts)
 
     def _hints(self) -> list[str]:
@@ -266,4 +266,4 @@ class DecodeReport:
     def _warn(sentences: list[str]) -> None:
         sys.stdout.flush()
         for sentence in sentences:
-            sys.stderr.write(f"canductor: {sentence}\n")
+            show_error(f"canductor: {sentence}")

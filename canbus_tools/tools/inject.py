@@ -23,6 +23,7 @@ from canbus_tools.inject.fault_options import declare_faults, read_faults
 from canbus_tools.inject.inject_report import InjectReport, StatusLine
 from canbus_tools.inject.socketcand_server import PORT, SocketcandServer
 from nodes.support.option_values import UsageError, decimal, integer, options_from, parse_int
+from nodes.support.terminal import show
 from nodes.virtual.faults import BusFault
 from nodes.virtual.hub import BITRATE_MAX, BusStats, VirtualBus
 from nodes.virtual.processes import Flavour, NodeProcess
@@ -234,5 +235,4 @@ class Injection:
             if server is not None:
                 lines.append(f"socketcand at {server.host}:{server.port}, bus {server.name}")
             said = "\n".join(lines)
-        sys.stdout.write(said + "\n")
-        sys.stdout.flush()
+        show(said)

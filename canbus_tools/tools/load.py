@@ -29,6 +29,7 @@ from canbus_tools.recordings.recordings import read_frames
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, decimal, parse_path
+from nodes.support.terminal import show
 
 DURATION_S: Final = 10.0
 DURATION_S_MAX: Final = 86_400.0
@@ -323,12 +324,9 @@ class _Screen:
         if self._in_place:
             text = report.to_text()
             up = f"\x1b[{self._lines}F" if self._lines else ""
-            sys.stdout.write(f"{up}\x1b[J{text}\n")
+            show(text, before=f"{up}\x1b[J")
             self._lines = text.count("\n") + 1
         else:
             load = report.load
             now = load.windows[-2].load if len(load.windows) > 1 else load.mean
-            sys.stdout.write(
-                f"{load.duration_s:.0f} s: {now:.1%} now, {load.mean:.1%} mean, {load.peak:.1%} peak\n"
-            )
-        sys.stdout.flush()
+            show(f"{load.duration_s:.0f} s: {now:.1%} now, {load.mean:.1%} mean, {load.peak:.1%} peak")

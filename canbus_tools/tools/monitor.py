@@ -27,6 +27,7 @@ from nodes.dictionary.dictionary import Dictionary
 from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, decimal, options_from, parse_int
+from nodes.support.terminal import show, show_error
 
 FETCHED: Final = "fetched from the node"
 EVERY_NODE: Final = "all"
@@ -117,7 +118,7 @@ async def fetch(computer: Computer, options: BusOptions, nodes: tuple[str, ...])
             for entry in entries:
                 if entry.facts is None and entry.nodeid is not None:
                     why = entry.trouble or "another host uses it"
-                    sys.stderr.write(f"canductor: node {entry.nodeid} was not queried: {why}\n")
+                    show_error(f"canductor: node {entry.nodeid} was not queried: {why}")
         else:
             wanted = [int(node) for node in nodes]
             for nodeid in wanted:
@@ -149,8 +150,7 @@ class Lines:
         shown = 0
         with stop_flag() as flag:
             for said in self._said(flag):
-                sys.stdout.write(self._form(said) + "\n")
-                sys.stdout.flush()
+                show(self._form(said))
                 shown += 1
                 if self._queue.dropped > 2 * self._reported_drops:
                     self._report_drops()
@@ -160,15 +160,13 @@ class Lines:
 
     def _report_drops(self) -> None:
         self._reported_drops = self._queue.dropped
-        sys.stderr.write(
-            f"canductor: dropped {self._reported_drops} frames so far: lines are read too slowly\n"
-        )
+        show_error(f"canductor: dropped {self._reported_drops} frames so far: lines are read too slowly")
 
     def _report_guesses(self) -> None:
         """Report each only once; there are at most 255 nodes, and 64 dictionaries in the cache."""
         guesses = {guess for node in self._watch.decoder.nodes.values() if (guess := node.guess)}
         for guess in sorted(guesses - self._reported):
-            sys.stderr.write(f"canductor: {guess}\n")
+            show_error(f"canductor: {guess}")
         self._reported |= guesses
 
     def _said(self, flag: StopFlag) -> Iterator[Decoded]:

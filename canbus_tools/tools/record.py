@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import errno
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, decimal, parse_path
+from nodes.support.terminal import show_error
 
 LOOK_S: Final = 0.1
 """Interval of checks for Ctrl-C and the end of the time on a silent bus."""
@@ -80,8 +80,7 @@ def record_bus(
         decoder = BusDecoder(DictionarySource(dictionaries, DictionaryCache.of_user()))
         log = path.suffix.lower() == ".log"
         recorder = CandumpFile(file) if log else McapFile(file, decoder)
-        sys.stderr.write(f"recording {options.name} to '{path}'; Ctrl-C ends it\n")
-        sys.stderr.flush()
+        show_error(f"recording {options.name} to '{path}'; Ctrl-C ends it")
         try:
             for frame in _until_end(computer, bus, flag, duration_s):
                 recorder.frame(frame)

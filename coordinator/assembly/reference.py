@@ -19,6 +19,7 @@ from coordinator.config.sections.kinematics import dual_carriage as read_dual
 from coordinator.config.sections.kinematics.registry import KINDS, PRINTER_SPECS
 from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.modules.registry import own_modules, own_option_readers
+from nodes.support.terminal import show
 
 _BEGIN: Final = "<!-- The tables below"
 _END: Final = "## Sections that are not supported yet\n"
@@ -125,9 +126,8 @@ def with_tables(page: str) -> str:
 def main() -> None:
     """Print all tables, or put them into the pages that are named."""
     if len(sys.argv) == 1:
-        sys.stdout.write(
-            "\n".join(section_table(title) for title in sections()) + "\n" + unsupported_sections()
-        )
+        tables = "\n".join(section_table(title) for title in sections())
+        show(f"{tables}\n{unsupported_sections()}", end="")
     for path in map(Path, sys.argv[1:]):
         path.write_text(with_tables(path.read_text(encoding="utf-8")), encoding="utf-8")
 

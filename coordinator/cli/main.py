@@ -19,6 +19,7 @@ from coordinator.support.report import Report
 from coordinator.support.version import version
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import ParserExit, UsageError
+from nodes.support.terminal import show, show_error
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -86,25 +87,21 @@ def _run(words: list[str], as_json: bool, parse: Callable[[Sequence[str]], Job])
 
 def _show(report: Report, as_json: bool) -> int:
     if as_json:
-        _print_json({"ok": report.ok, **report.to_json()})
+        _show_json({"ok": report.ok, **report.to_json()})
     elif text := report.to_text():
-        _print(text)
+        show(text)
     return EXIT_OK if report.ok else EXIT_FAILED
 
 
 def _fail(sentence: str, status: int, as_json: bool) -> int:
-    sys.stderr.write(f"canductor: {sentence}\n")
+    show_error(f"canductor: {sentence}")
     if as_json:
-        _print_json({"ok": False, "error": sentence})
+        _show_json({"ok": False, "error": sentence})
     return status
 
 
-def _print_json(values: Mapping[str, object]) -> None:
-    _print(json.dumps(values, allow_nan=False))
-
-
-def _print(line: str) -> None:
-    sys.stdout.write(line + "\n")
+def _show_json(values: Mapping[str, object]) -> None:
+    show(json.dumps(values, allow_nan=False))
 
 
 def _report_bug(as_json: bool) -> int:

@@ -13,11 +13,9 @@ from typing import Any, Generic, TypeVar
 from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawOption, RawSection
 from coordinator.support.quoting import nearest, nearest_or_all, shown
+from nodes.support.numbers import read_decimal, read_whole
 
 T = TypeVar("T")
-_FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-_INT = re.compile(r"[-+]?\d+", re.ASCII)
-_MAX_NUMBER_CHARS = 40
 _TRUE = ("1", "yes", "true", "on")
 _FALSE = ("0", "no", "false", "off")
 
@@ -110,7 +108,8 @@ class FloatOption(_Bounded[float]):
 
     def parse(self, text: str) -> float:
         """Return the number; neither infinite nor NaN."""
-        if len(text) > _MAX_NUMBER_CHARS or not _FLOAT.fullmatch(text) or abs(value := float(text)) > 1e15:
+        value = read_decimal(text)
+        if value is None:
             raise BadValue
         self._check(value)
         return value
@@ -132,9 +131,9 @@ class IntOption(_Bounded[int]):
 
     def parse(self, text: str) -> int:
         """Return the number."""
-        if len(text) > _MAX_NUMBER_CHARS or not _INT.fullmatch(text):
+        value = read_whole(text)
+        if value is None:
             raise BadValue
-        value = int(text)
         self._check(value)
         if value % self.multiple_of:
             raise BadValue
@@ -263,13 +262,13 @@ class GearRatioOption(Option[float]):
         """Return the product of the ratios."""
         ratio = 1.0
         for pair in text.split(","):
-            motor, colon, output = (part.strip() for part in pair.partition(":"))
-            if not colon or not all(
-                len(n) <= _MAX_NUMBER_CHARS and _FLOAT.fullmatch(n) and 1e-6 < float(n) < 1e6
-                for n in (motor, output)
-            ):
+            before, colon, behind = (part.strip() for part in pair.partition(":"))
+            motor, output = read_decimal(before), read_decimal(behind)
+            if not colon or motor is None or output is None:
                 raise BadValue
-            ratio *= float(motor) / float(output)
+            if not 1e-6 < motor < 1e6 or not 1e-6 < output < 1e6:
+                raise BadValue
+            ratio *= motor / output
         if not 1e-6 <= ratio <= 1e6:
             raise BadValue
         return ratio

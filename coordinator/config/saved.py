@@ -192,7 +192,8 @@ def replace_file(path: str, before: bytes, after: bytes) -> None:
     try:
         real = Path(path).resolve(strict=True)
         status = real.stat()
-        if not stat.S_ISREG(status.st_mode) or real.read_bytes() != before:
+        # AFTER: an earlier attempt failed when all but its last step was done.
+        if not stat.S_ISREG(status.st_mode) or real.read_bytes() not in (before, after):
             raise SaveError(
                 f"{shown_path(path)} has changed since it was read, so nothing was saved; RESTART reads it"
                 " again, then calibrate again"

@@ -25,6 +25,7 @@ from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.client.upload import send_program, show_progress
 from coordinator.support.report import PlainReport, Report
 from nodes.support.errors import CanductorError
+from nodes.support.terminal import show_error
 
 POLL_PERIOD_S: Final = 0.02
 UNREADABLE: Final = (
@@ -43,8 +44,7 @@ class SerialPort(Line, Protocol):
 
 
 def _print_notice(sentence: str) -> None:
-    sys.stderr.write(f"{sentence}\n")
-    sys.stderr.flush()
+    show_error(sentence)
 
 
 @dataclass(frozen=True, slots=True)

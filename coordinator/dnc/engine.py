@@ -38,6 +38,7 @@ from coordinator.dnc.blocks import (
 from coordinator.dnc.lexer import Lexer
 from coordinator.dnc.options import DncOptions
 from coordinator.dnc.tokens import Kind, Token
+from nodes.support.terminal import printable
 
 DIRECTORY_MAX: Final = 262_144
 """Bytes of a directory."""
@@ -541,7 +542,7 @@ class Engine:
             self._events.append(events.Asked(header))
 
     def _error_received(self, token: Token) -> None:
-        text = "".join(c if c.isprintable() else "?" for c in token.content.decode("latin-1").rstrip())
+        text = printable(token.content.decode("latin-1").rstrip())
         self._say(bytes((ACK, EOT)))
         self._end(events.Failed(f"the peripheral reports: {text or 'an error'}"))
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from coordinator.dnc.blocks import BadText, is_text
+from coordinator.support.atomic_file import claim, remove_unfinished
 from nodes.support.errors import CanductorError
 
 Check = Callable[[bytes, str], None]
@@ -35,6 +36,7 @@ NAME_MAX: Final = 100
 _RESERVED: Final = re.compile(r"(con|prn|aux|nul|clock\$|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _PLAIN: Final = re.compile(r"[^\x00-\x1f\x7f-\uffff/\\:*?\"<>|]+")
 _READ: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_PREFIX: Final = ".dnc-"
 _CREATE: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -185,9 +187,11 @@ class Incoming:
         self._folder = folder
         self._folder_fd = fd
         self._check = check
-        self._partial = f".dnc-{secrets.token_hex(8)}.part"
+        remove_unfinished(folder.path, _PREFIX)
+        self._partial = f"{_PREFIX}{secrets.token_hex(8)}.part"
         try:
             self._file = os.fdopen(os.open(self._partial, _CREATE, 0o644, dir_fd=fd), "wb")
+            claim(self._file.fileno())
         except OSError as error:
             raise FileRefused(
                 f"no file can be created in {folder.path}: {_why(error)}; use another folder", "DISK ERROR"

@@ -41,6 +41,7 @@ from coordinator.web.settings import WebSettings
 from nodes.dictionary.cache import DictionaryCache
 from nodes.support.host_sockets import socket_folder
 from nodes.support.state_folder import state_folder
+from nodes.support.terminal import show
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,6 +138,7 @@ class _ServiceProcess:
             cache=self._cache,
             on_line=lambda entry: self._on_entry(service, entry),
         )
+        service.claim_folder()  # before uploads are removed that may be those of another service
         add_methods(service, registry)
         if settings.jobs is not None:
             registry.add(upload_method(settings.jobs))
@@ -287,5 +289,4 @@ def _address(options: ServeOptions, port: int | None) -> str:
 
 
 def _print(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+    show(line)

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.motion.steps.surface import Surface
+from nodes.support.terminal import printable_lines
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +174,10 @@ class Reply:
     text: str
     kind: ReplyKind = ReplyKind.INFORMATION
 
+    def __post_init__(self) -> None:
+        """Replace what a terminal would obey: programs and macros may put anything into it."""
+        object.__setattr__(self, "text", printable_lines(self.text))
+
 
 @dataclass(frozen=True, slots=True)
 class Notice:
@@ -180,6 +185,10 @@ class Notice:
 
     line: int
     text: str
+
+    def __post_init__(self) -> None:
+        """Replace what a terminal would obey."""
+        object.__setattr__(self, "text", printable_lines(self.text))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,11 +1,13 @@
 """Reads one G-code line that the hot path left to Python. Never raises anything but WordError."""
 
-import math
 import re
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, reduce
 from operator import xor
+
+from nodes.support.numbers import read_decimal
+from nodes.support.terminal import printable_lines
 
 _CODE = re.compile(r"([GMTgmt])(\d{1,9})(\.\d{1,9})?(?![\d_.])", re.ASCII)
 _NAME = re.compile(r"[A-Za-z_]\w*(?=[ \t;]|$)", re.ASCII)
@@ -14,6 +16,7 @@ _LINE_NUMBER = re.compile(rb"[Nn]\d+[ \t]*")
 _CHECKSUM = re.compile(rb"\*[ \t]*(\S*)[ \t]*$")
 _WORD = re.compile(r"\s*([A-Za-z])([+-]?(?:\d+\.?\d*|\.\d+)|(?=\s|$))\s*", re.ASCII)
 _PARAMETER = re.compile(r"\s*([A-Za-z_]\w*)=(\"[^\"]*\"|'[^']*'|\S*)(?:\s+|$)", re.ASCII)
+_PLAIN = re.compile(r"[\w.+-]+", re.ASCII)
 _QUOTED_MAX = 40
 _LINE_MAX = 4096
 
@@ -90,17 +93,32 @@ def quoted(text: str) -> str:
     return ascii(text if len(text) <= _QUOTED_MAX else text[:_QUOTED_MAX] + "...")
 
 
+def command_line(name: str, **parameters: str | float) -> str:
+    """Return the line that is read as the command NAME with PARAMETERS, whatever they hold.
+
+    Raises WordError where no line can say it: nothing in a parameter becomes a command or another parameter.
+    """
+    texts = {key: text if isinstance(text, str) else f"{text:.12g}" for key, text in parameters.items()}
+    words = [name]
+    for key, text in texts.items():
+        quote = "'" if '"' in text else '"'
+        words.append(f"{key}={text}" if _PLAIN.fullmatch(text) else f"{key}={quote}{text}{quote}")
+    line = " ".join(words)
+    found = None if "\n" in line else parse(line.encode(errors="replace"))
+    if found is None or found.name != name or found.parameters() != texts:
+        given = ", ".join(f"{key}={quoted(text)}" for key, text in texts.items())
+        raise WordError(f"{name} cannot be written with {given}; use names without ; and quotes")
+    return line
+
+
 def number(what: str, words: Mapping[str, str], key: str) -> float:
     """Return the number of WORDS[KEY]; WHAT is the command's name."""
     text = words[key]
     if not text:
         raise WordError(f"{key} of {what} has no number; write {key} and a decimal number")
-    try:
-        value = float(text)
-    except ValueError:
-        raise WordError(f"{key} of {what} is {quoted(text)}, which is not a number") from None
-    if not math.isfinite(value):
-        raise WordError(f"{key} of {what} is {quoted(text)}, which is out of range")
+    value = read_decimal(text)
+    if value is None:
+        raise WordError(f"{key} of {what} is {quoted(text)}, which is not a number, or is out of range")
     return value
 
 
@@ -109,7 +127,7 @@ def parse(line: bytes) -> Command | None:
     """Read LINE; None when there is nothing to do. Raises WordError."""
     if len(line) > _LINE_MAX:
         raise WordError(f"this command is longer than {_LINE_MAX} bytes; is this a G-code file?")
-    text = _without_frame(line.strip(b" \t\r\n")).decode("utf-8", "replace")
+    text = printable_lines(_without_frame(line.strip(b" \t\r\n")).decode("utf-8", "replace"))
     if text.startswith("("):
         text = _without_comments(text)
     text = text.strip()

@@ -2,6 +2,7 @@
 
 import os
 import select
+import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from io import FileIO
@@ -26,6 +27,34 @@ class ByteSource(Protocol):
 
     def close(self) -> None:
         """Release it."""
+
+
+class UnchangedFile(FileIO):
+    """A file whose content stays as it was when it was opened: what was changed since is never returned.
+
+    A pipe, which has no content of its own, is read as it comes.
+    """
+
+    def __init__(self, file: str | Path | int, name: str) -> None:
+        super().__init__(file)
+        self._shown = name
+        self.status = os.fstat(self.fileno())
+
+    def read(self, size: int | None = -1, /) -> bytes | None:  # type: ignore[override]  # as FileIO does
+        """Return what follows; raises CanductorError once the file was changed, OSError."""
+        piece = super().read(size)
+        now = os.fstat(self.fileno())
+        if stat.S_ISREG(now.st_mode) and _content_stamp(now) != _content_stamp(self.status):
+            how = f"truncated to {now.st_size:,} bytes" if now.st_size < self.status.st_size else "changed"
+            raise CanductorError(
+                f"{self._shown} was {how} while it was being printed; what was read before was carried out,"
+                " the rest was not"
+            )
+        return piece
+
+
+def _content_stamp(status: os.stat_result) -> tuple[int, int]:
+    return status.st_size, status.st_mtime_ns
 
 
 class _Pieces:
@@ -95,10 +124,8 @@ class Program:
             # Unbuffered: what a person or a program typed is acted on at once, not when a block is full.
             return cls(FileIO(sys.stdin.fileno(), closefd=False), "standard input")
         try:
-            source = FileIO(path)
-            size = source.seek(0, 2) if source.seekable() else None
-            if size is not None:
-                source.seek(0)
+            source = UnchangedFile(path, str(path))
+            size = source.status.st_size if stat.S_ISREG(source.status.st_mode) else None
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             raise CanductorError(f"cannot read the G-code file {path}: {reason}; check the path") from error

@@ -12,6 +12,7 @@ from typing import Any, Final
 from coordinator.ipc.protocol.decoding import RejectedError, check_values, decode_json
 from coordinator.ipc.protocol.limits import Limits
 from nodes.support.errors import CanductorError
+from nodes.support.terminal import printable_lines
 
 END: Final = b"\x03"
 MESSAGE_BYTES_MAX: Final = 262_144
@@ -108,7 +109,9 @@ def result_message(request_id: Any, result: Mapping[str, Any]) -> bytes:
 
 def error_message(request_id: Any, sentence: str) -> bytes:
     """Return the answer to a call that failed."""
-    return encode({"id": request_id, "error": {"error": "WebRequestError", "message": sentence}})
+    return encode(
+        {"id": request_id, "error": {"error": "WebRequestError", "message": printable_lines(sentence)}}
+    )
 
 
 def event_message(template: Mapping[str, Any], params: Mapping[str, Any]) -> bytes:

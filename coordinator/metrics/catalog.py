@@ -3,10 +3,11 @@
 docs/metrics.md has the same as a table: paste what ``python -m coordinator.metrics.catalog`` prints.
 """
 
-import sys
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
+
+from nodes.support.terminal import show
 
 
 class Kind(StrEnum):
@@ -290,4 +291,4 @@ def _meaning(group: Group, metric: Metric) -> str:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(table())
+    show(table(), end="")

@@ -16,9 +16,9 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from coordinator.ipc.protocol.methods import printable
 from coordinator.metrics.catalog import BUSES, GROUPS, MODULES, NODES, PREFIX, Group, Kind, Metric
 from coordinator.support.values import Value
+from nodes.support.terminal import printable
 
 ENTITIES_MAX: Final = 256
 """Nodes, buses, and sections, that are shown; each node is some eighty series."""

@@ -18,15 +18,17 @@ A restart makes new modules: all state is in the object. Everything happens on t
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from coordinator.config.errors import NotSupported, Place
+from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawSection
 from coordinator.config.model import MachineDescription
 from coordinator.config.options import BadValue, ListOption, Option, SectionReader, SectionSpec
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.gcode.commands import Call, GCodeCommand, Reading
+from coordinator.gcode.parser import WordError, command_line
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.machine import Modules
 from coordinator.runtime.module_context import ModuleContext
+from coordinator.support.quoting import shown
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
@@ -146,8 +148,18 @@ class Build:
 
     @property
     def instance(self) -> str:
-        """What follows the section's first word: ``hotend``; for a plain section the word itself."""
-        return self.reader.section.instance or self.name
+        """What follows the section's first word: ``hotend``; for a plain section the word itself.
+
+        Raises ConfigError for a name that no command can be given.
+        """
+        name = self.reader.section.instance or self.name
+        try:
+            command_line("NAMED", NAME=name)
+        except WordError:
+            raise ConfigError(
+                self.place, f"{shown(name)} cannot be named in a command; leave out ; and quotes"
+            ) from None
+        return name
 
     @property
     def place(self) -> Place:

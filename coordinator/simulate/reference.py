@@ -6,12 +6,12 @@
 import dataclasses
 import inspect
 import re
-import sys
 from collections.abc import Iterator
 from typing import Any
 
 from coordinator.simulate import scenario
 from coordinator.support.toml_values import Range
+from nodes.support.terminal import show
 
 TABLES: dict[str, type[Any]] = {
     "[nodes.NAME]": scenario.NodeSetting,
@@ -60,7 +60,7 @@ def _default(value: object) -> str:
 
 def main() -> None:
     """Print all tables."""
-    sys.stdout.write("\n".join([*(table(title) for title in TABLES), faults()]))
+    show("\n".join([*(table(title) for title in TABLES), faults()]), end="")
 
 
 if __name__ == "__main__":

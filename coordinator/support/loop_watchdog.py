@@ -18,6 +18,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any, Final
 
+from nodes.support.terminal import show_error
+
 LOOK_S: Final = 0.02
 """From so long on, a loop that is still at work is looked at."""
 AGAIN_S: Final = 0.01
@@ -161,7 +163,7 @@ class LoopWatchdog:
                 self._while_held()
                 self._look(since_s)
             except Exception:  # noqa: BLE001 (it has to go on: it may be what stops the machine)
-                traceback.print_exc()
+                show_error(traceback.format_exc())
 
     def _look(self, since_s: float) -> None:
         """Report a hold that began at SINCE_S, once."""
@@ -170,7 +172,7 @@ class LoopWatchdog:
             self._first = (since_s, now_s, time.clock_gettime(self._cpu_clock))
         if now_s - since_s >= STUCK_S and self._stuck_s != since_s:
             self._stuck_s = since_s
-            sys.stderr.write(f"canductor: the control loop is held for {STUCK_S:g} s by {self._where()}\n")
+            show_error(f"canductor: the control loop is held for {STUCK_S:g} s by {self._where()}")
         if now_s - since_s < HELD_S or self._seen_s == since_s:
             return
         self._seen_s = since_s

@@ -16,6 +16,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from nodes.support.terminal import printable, show
+
 LIVE_INTERVAL_S = 0.2
 PLAIN_INTERVAL_S = 5.0
 
@@ -95,7 +97,7 @@ class ProgressDisplay:
         stderr: TextIO | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._title = title
+        self._title = printable(title)
         self._stdout = stdout or sys.stdout
         self._stderr = stderr or sys.stderr
         self._clock_s = clock_s
@@ -137,8 +139,7 @@ class ProgressDisplay:
         if self._live is not None:
             self._live.update(self._picture(progress), refresh=True)
         elif not self._is_live:
-            self._stderr.write(f"{self._title}: {summary(progress)}\n")
-            self._stderr.flush()
+            show(f"{self._title}: {summary(progress)}", self._stderr)
 
     def _picture(self, progress: Progress) -> "Table":
         picture = Table.grid(padding=(0, 1))
@@ -151,7 +152,7 @@ class ProgressDisplay:
                 figures.add_column(heading, justify="right")
             for node in progress.nodes:
                 figures.add_row(
-                    Text(node.name),
+                    Text(printable(node.name)),
                     _figure(node.round_trip_ms, 2),
                     f"{node.retransmitted_bytes:,}",
                     f"{node.queue_depth:,}",

@@ -3,6 +3,8 @@
 import difflib
 from collections.abc import Iterable
 
+from nodes.support.terminal import printable
+
 _SHOWN_CHARS = 60
 _SHOWN_PATH_CHARS = 300
 
@@ -12,12 +14,12 @@ def shown(text: str) -> str:
     line = " ".join(text.split())
     if len(line) > _SHOWN_CHARS:
         line = line[: _SHOWN_CHARS - 1] + "…"
-    return "'" + "".join(c if c.isprintable() else "?" for c in line) + "'"
+    return f"'{printable(line)}'"
 
 
 def shown_path(path: str) -> str:
     """Quote a path; of a long one the end is shown."""
-    line = "".join(c if c.isprintable() else "?" for c in path)
+    line = printable(path)
     return f"'{line}'" if len(line) <= _SHOWN_PATH_CHARS else f"'…{line[-_SHOWN_PATH_CHARS:]}'"
 
 

@@ -1,7 +1,6 @@
 """Reads axis tables from files: LinuxCNC's COMP_FILE of both types, and CSV with units in its header."""
 
 import csv
-import math
 import re
 import stat
 from collections.abc import Iterator
@@ -9,6 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from coordinator.tables.axis_table import POINTS, AxisTable, TableError, Unit, problem_of
+from nodes.support.numbers import read_decimal
+from nodes.support.terminal import printable
 
 FILE_BYTES_MAX: Final = 4_000_000
 LENGTHS: Final = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "inch": 25.4}
@@ -75,12 +76,9 @@ def _factor(unit: str) -> float:
 
 def _number(path: Path, line: int, text: str) -> float:
     text = text.strip()
-    if (
-        len(text) > _NUMBER_CHARS_MAX
-        or not _NUMBER.fullmatch(text)
-        or not math.isfinite(value := float(text))
-    ):
-        shown = "".join(c if c.isprintable() else "?" for c in text[:_NUMBER_CHARS_MAX])
+    value = read_decimal(text)
+    if value is None:
+        shown = printable(text[:_NUMBER_CHARS_MAX])
         raise TableError(f"{path}:{line}: '{shown}' is no number; write it as 12.5")
     return value
 

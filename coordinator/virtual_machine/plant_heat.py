@@ -14,6 +14,7 @@ from coordinator.config.model import MachineDescription
 from coordinator.config.options import BadValue
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.config.sections.nodes import make_pin_registry
+from nodes.support.numbers import read_decimal
 from nodes.virtual.plant import (
     Beta,
     Body,
@@ -279,11 +280,8 @@ def _text(section: RawSection, option: str) -> str:
 
 def _number(section: RawSection, option: str, otherwise: float) -> float:
     """Return a number; OTHERWISE where it is none: who reads the section says what is wrong."""
-    try:
-        value = float(_text(section, option) or otherwise)
-    except ValueError:
-        return otherwise
-    return value if math.isfinite(value) else otherwise
+    value = read_decimal(_text(section, option) or "")
+    return otherwise if value is None else value
 
 
 def plant_word(name: str) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from nodes.support.errors import CanductorError
+from nodes.support.numbers import read_decimal, read_whole
 
 T = TypeVar("T")
 
@@ -120,9 +121,8 @@ def parse_assignment(text: str, convert: Callable[[str], T]) -> tuple[str, T]:
 
 def parse_int(text: str, low: int = 0, high: int | None = None, *, name: str = "") -> int:
     """Return a whole number from LOW to HIGH; raises UsageError."""
-    digits = text.strip()
-    number = int(digits) if digits.isascii() and digits.isdecimal() and len(digits) <= 20 else -1
-    if number < low or (high is not None and number > high):
+    number = read_whole(text.strip())
+    if number is None or number < low or (high is not None and number > high):
         bounds = f"of at least {low}" if high is None else f"from {low} to {high}"
         raise _invalid(name, text, f"a whole number {bounds}")
     return number
@@ -130,22 +130,16 @@ def parse_int(text: str, low: int = 0, high: int | None = None, *, name: str = "
 
 def parse_hex(text: str, high: int, *, name: str = "") -> int:
     """Return a number from 0 to HIGH that may be written in hex, as in 0x1f; raises UsageError."""
-    try:
-        value = int(text, 0)
-    except ValueError:
-        value = -1
-    if not 0 <= value <= high:
+    value = read_whole(text, may_be_hex=True)
+    if value is None or not 0 <= value <= high:
         raise _invalid(name, text, f"a number from 0 to {high:#x}")
     return value
 
 
 def parse_float(text: str, low: float, high: float, unit: str = "", *, name: str = "") -> float:
     """Return a number from LOW to HIGH, in UNIT; raises UsageError."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = low - 1
-    if not low <= value <= high:
+    value = read_decimal(text)
+    if value is None or not low <= value <= high:
         raise _invalid(name, text, f"a number from {low:g} to {high:g}{unit and ' ' + unit}")
     return value
 
@@ -162,13 +156,11 @@ def decimal(low: float, high: float, unit: str = "") -> Callable[[str], float]:
 
 def parse_ratio(text: str, high: float = 0.5, *, name: str = "") -> float:
     """Return a ratio from 0 to HIGH, also written as a percentage; raises UsageError."""
-    try:
-        value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value <= high:
+    value = read_decimal(text.removesuffix("%"))
+    ratio = -1.0 if value is None else value / (100 if text.endswith("%") else 1)
+    if not 0 <= ratio <= high:
         raise _invalid(name, text, f"a ratio from 0 to {high:g}, or a percentage such as 1%")
-    return value
+    return ratio
 
 
 def parse_path(text: str, *suffixes: str) -> Path:

@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from nodes.support.terminal import printable
+
 COLOURS: Final = ("#1f6fb4", "#d1495b", "#2e8b57", "#8e5bb5", "#c77d0a", "#4a4a4a")
 WIDTH, LEFT, RIGHT, TOP, GAP, BOTTOM = 1000, 80, 20, 52, 50, 44
 COLUMNS_MAX: Final = 1000
@@ -81,8 +83,7 @@ def staircase(values: Sequence[float], bin_width: float) -> list[Point]:
 
 def escape(text: str) -> str:
     """Return TEXT escaped for SVG, without control characters."""
-    shown = "".join(c if c.isprintable() else "?" for c in text)
-    return shown.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return printable(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
 def _panel(panel: Panel, top: int, x_range: Point, x_ticks: Sequence[float]) -> Iterator[str]:

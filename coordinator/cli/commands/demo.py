@@ -10,6 +10,7 @@ from coordinator.demo.run import DemoOptions, run_demo
 from coordinator.demo.serve import serve_demo
 from coordinator.support.examples import DEMO_GCODE, DEMO_MACHINE, find_machine
 from coordinator.support.report import Report
+from nodes.support.numbers import read_decimal, read_whole
 from nodes.support.option_values import (
     Assignments,
     UsageError,
@@ -102,17 +103,14 @@ def _bus_interface(text: str) -> tuple[str, str]:
 
 
 def _ppm(text: str) -> float:
-    rule = "a number in ppm, from -10000 to 10000"
-    try:
-        value = float(text)
-    except ValueError:
-        raise ValueError(rule) from None
-    if not -10_000 <= value <= 10_000:
-        raise ValueError(rule)
+    value = read_decimal(text)
+    if value is None or not -10_000 <= value <= 10_000:
+        raise ValueError("a number in ppm, from -10000 to 10000")
     return value
 
 
 def _ticks(text: str) -> int:
-    if not (text.isascii() and text.isdecimal() and len(text) <= 20 and int(text) < 2**64):
+    ticks = read_whole(text)
+    if ticks is None or not 0 <= ticks < 2**64:
         raise ValueError("a whole number of ticks, from 0 to 2^64 - 1")
-    return int(text)
+    return ticks

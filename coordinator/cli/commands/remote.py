@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import sys
 from typing import Any
 
 from coordinator.cli.arguments.target import declare_target, target_of
@@ -11,9 +10,12 @@ from coordinator.ipc.client.target import Target
 from coordinator.ipc.client.upload import send_program, show_progress
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.support.interrupts import Terminated
+from coordinator.support.job_names import RULE, is_job_name
+from coordinator.support.quoting import shown as quoted
 from coordinator.support.report import PlainReport
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, add_command, decimal, existing_file, integer
+from nodes.support.terminal import show, show_error
 
 
 def add_to(commands: Any) -> None:
@@ -58,6 +60,8 @@ def _declare_send(command: argparse.ArgumentParser) -> None:
 
 def _send(given: argparse.Namespace) -> PlainReport:
     name = given.name or given.file.name
+    if not is_job_name(name):
+        raise UsageError(f"{quoted(name)} must be {RULE}; give --name")
     result = send_program(
         target_of(given),
         given.file,
@@ -149,8 +153,7 @@ def _watch(given: argparse.Namespace) -> PlainReport:
 
 def _report_no_match(fields: list[str], *, waiting: bool) -> None:
     addition = "; waiting for one that does" if waiting else ""
-    sys.stderr.write(f"canductor: no field matches {' '.join(fields)} now{addition}\n")
-    sys.stderr.flush()
+    show_error(f"canductor: no field matches {' '.join(fields)} now{addition}")
 
 
 def _show_update(update: Update, *, as_json: bool) -> None:
@@ -161,11 +164,10 @@ def _show_update(update: Update, *, as_json: bool) -> None:
             "values": update.values,
             "removed": sorted(update.removed),
         }
-        sys.stdout.write(json.dumps(shown) + "\n")
+        show(json.dumps(shown))
     else:
-        sys.stdout.writelines(f"{path} = {_word(update.values[path])}\n" for path in sorted(update.values))
-        sys.stdout.writelines(f"{path} is gone\n" for path in sorted(update.removed))
-    sys.stdout.flush()
+        lines = [f"{path} = {_word(update.values[path])}" for path in sorted(update.values)]
+        show("\n".join([*lines, *(f"{path} is gone" for path in sorted(update.removed)), ""]), end="")
 
 
 def _word(value: object) -> str:

@@ -24,6 +24,7 @@ from coordinator.support.report import Report
 from coordinator.tables.store import table_folder
 from nodes.dictionary.cache import DictionaryCache
 from nodes.support.option_values import UsageError, add_command, existing_file, options_from
+from nodes.support.terminal import show
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,5 +169,4 @@ def _progress(options: RunOptions, program: Program) -> Iterator[Callable[[Progr
 
 
 def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+    show(line)

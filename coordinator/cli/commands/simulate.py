@@ -5,6 +5,7 @@ from typing import Any, Final
 
 from coordinator.simulate.run import SimulateOptions, run_simulation
 from coordinator.support.report import Report
+from nodes.support.numbers import read_whole
 from nodes.support.option_values import UsageError, add_command, integer, options_from
 
 SEED_MAX: Final = 2**32
@@ -48,9 +49,10 @@ def _run(given: argparse.Namespace) -> Report:
 
 def _seeds(text: str) -> range:
     first, colon, end = text.partition(":")
-    if not (colon and all(word.isascii() and word.isdecimal() and len(word) <= 10 for word in (first, end))):
+    low, high = read_whole(first), read_whole(end)
+    if not colon or low is None or high is None or low < 0:
         raise UsageError(f"is '{text}', must be A:B, two whole numbers such as 0:100")
-    seeds = range(int(first), int(end))
-    if not 0 < len(seeds) <= SEEDS_AT_ONCE_MAX:
+    seeds = range(low, high)
+    if not 0 < high - low <= SEEDS_AT_ONCE_MAX:
         raise UsageError(f"is '{text}', must be A:B with B above A, at most {SEEDS_AT_ONCE_MAX:,} seeds")
     return seeds

@@ -9,13 +9,14 @@ from coordinator.ipc.client.client import Client
 from coordinator.ipc.client.target import Target
 from coordinator.ipc.server.uploads import PART_MAX
 from nodes.support.errors import CanductorError
+from nodes.support.terminal import show
 
 
 def show_progress(sent: int, size: int) -> None:
     """Show on a terminal how many bytes of a file were sent."""
     if sys.stderr.isatty():
         end = "\n" if sent >= size else ""
-        sys.stderr.write(f"\rsent {sent:,} of {size:,} bytes{end}")
+        show(f"sent {sent:,} of {size:,} bytes", sys.stderr, before="\r", end=end)
 
 
 def send_program(

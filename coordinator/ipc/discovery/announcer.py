@@ -28,6 +28,7 @@ from coordinator.ipc.discovery.multicast import (
     reachable_addresses,
 )
 from nodes.support.errors import CanductorError
+from nodes.support.terminal import show
 
 RESCAN_S: Final = 10.0
 """Between checks whether this computer's addresses are still the same."""
@@ -178,8 +179,7 @@ async def _main() -> None:
 
 
 def _print(sentence: str) -> None:
-    sys.stdout.write(json.dumps(sentence) + "\n")
-    sys.stdout.flush()
+    show(json.dumps(sentence))
 
 
 if __name__ == "__main__":

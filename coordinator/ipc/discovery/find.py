@@ -12,9 +12,10 @@ from coordinator.ipc.client.client import Client
 from coordinator.ipc.discovery.announcement import Announcement, host_word
 from coordinator.ipc.discovery.browser import Browser, OpenServices
 from coordinator.ipc.discovery.multicast import interface_addresses
-from coordinator.ipc.protocol.methods import Scope, printable
+from coordinator.ipc.protocol.methods import Scope
 from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import host_sockets
+from nodes.support.terminal import printable
 
 SOCKETS_MAX: Final = 64
 """Sockets that are queried; with more of them, name one."""

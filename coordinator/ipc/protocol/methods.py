@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
+from nodes.support.terminal import printable
 
 INT_MIN: Final = -(2**63)
 INT_MAX: Final = 2**63 - 1
@@ -259,8 +260,3 @@ def shown(value: object, length_max: int = 40) -> str:
     if isinstance(value, int):
         return str(value) if INT_MIN <= value < 2**64 else "a huge number"
     return f"{value:g}" if isinstance(value, float) else f"of the type {type(value).__name__}"
-
-
-def printable(text: str) -> str:
-    """Return TEXT on one line, without what could steer a terminal."""
-    return "".join(c if c.isprintable() else "?" for c in text)

@@ -4,9 +4,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.ipc.protocol.limits import EndReason
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope, printable
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope
 from coordinator.ipc.server.state import costly_stars
 from coordinator.support.values import Value
+from nodes.support.terminal import printable
 
 if TYPE_CHECKING:
     from coordinator.ipc.server.session import Session

@@ -8,12 +8,13 @@ import asyncio
 import resource
 import socket
 import ssl
+from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
 BACKLOG: Final = 128
 HANDSHAKES_MAX: Final = 128
-"""TLS handshakes at a time; further connections are closed at once, before they cost more than a file."""
+"""TLS handshakes at a time; for one more, the oldest of the address that has most of them is closed."""
 HANDSHAKE_S: Final = 5.0
 ACCEPTS_PER_ROUND: Final = 8
 """Connections taken before the rest of the loop gets its turn."""
@@ -47,9 +48,10 @@ class TcpListener:
         self._may_enter = may_enter
         self._listeners: list[socket.socket] = []
         self._accepting: list[asyncio.Task[None]] = []
-        self._entering: set[asyncio.Task[None]] = set()
+        self._entering: dict[asyncio.Task[None], str] = {}
+        """Oldest first, with their addresses."""
         self.refused = 0
-        """Connections that were closed before their handshake."""
+        """Connections that were closed before or during their handshake, for lack of room."""
         self.starved = 0
         """How often the system had no file left for a connection."""
 
@@ -94,28 +96,37 @@ class TcpListener:
         loop, taken = asyncio.get_running_loop(), 0
         while True:
             try:
-                opened, _ = await loop.sock_accept(listener)
+                opened, address = await loop.sock_accept(listener)
             except ConnectionAbortedError:  # the client has left already
                 continue
             except OSError:  # no file or memory for it: others may free some
                 self.starved += 1
                 await asyncio.sleep(RETRY_S)
                 continue
-            self._take(opened, loop)
+            self._take(opened, address[0], loop)
             taken += 1
             if taken % ACCEPTS_PER_ROUND == 0:
                 await asyncio.sleep(0)  # sock_accept returns without a pause while some wait
 
-    def _take(self, opened: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
-        full = self._context is not None and len(self._entering) >= self._handshakes_max
-        if full or not self._may_enter(len(self._entering)):
+    def _take(self, opened: socket.socket, address: str, loop: asyncio.AbstractEventLoop) -> None:
+        if self._context is not None and len(self._entering) >= self._handshakes_max:
+            self._make_room()
+        if not self._may_enter(len(self._entering)):
             self.refused += 1
             opened.close()
             return
         arrived = [opened]
         task = loop.create_task(self._enter(arrived, loop))
-        self._entering.add(task)
+        self._entering[task] = address
         task.add_done_callback(lambda task: self._done(task, arrived))
+
+    def _make_room(self) -> None:
+        """End one handshake: whoever is silent must not keep others out, and others are likely elsewhere."""
+        busiest, _ = Counter(self._entering.values()).most_common(1)[0]
+        oldest = next(task for task, address in self._entering.items() if address == busiest)
+        del self._entering[oldest]
+        oldest.cancel()
+        self.refused += 1
 
     async def _enter(self, arrived: list[socket.socket], loop: asyncio.AbstractEventLoop) -> None:
         limit_s = None if self._context is None else HANDSHAKE_S
@@ -131,7 +142,7 @@ class TcpListener:
             return
 
     def _done(self, task: asyncio.Task[None], arrived: list[socket.socket]) -> None:
-        self._entering.discard(task)
+        self._entering.pop(task, None)
         for opened in arrived:  # it was cancelled before its first step
             opened.close()
 

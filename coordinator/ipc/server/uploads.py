@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import os
 import shutil
 import stat
@@ -11,19 +12,21 @@ from threading import Lock
 from typing import Any, Final
 
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
+from coordinator.support.job_names import NAME_BYTES_MAX, RULE, SUFFIXES, is_job_name
 from coordinator.support.values import Value
 
 PART_MAX: Final = 32_768
 """Characters of one part; however they are written, a message holds them."""
 SIZE_MAX: Final = 2**31
-NAME_MAX: Final = 128
 PARTS_MAX: Final = 4
 """Files of one client that are not complete."""
 FREE_MIN: Final = 256 * 2**20
 """Bytes of the disk that stay free: the journal and the logs need some."""
-SUFFIXES: Final = (".gcode", ".gco", ".g", ".nc", ".ngc")
+_ENDS: Final = ", ".join(SUFFIXES)
 _FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 _PARTIAL: Final = ".part"
+_NO_LINKS: Final = (errno.EPERM, errno.ENOTSUP, errno.EMLINK)
+"""Of a disk without hard links."""
 
 
 def upload_method(folder: Path) -> Method:
@@ -36,7 +39,12 @@ def upload_method(folder: Path) -> Method:
         "Write a part of a file for the job folder; the file appears with its last part.",
         uploads.upload,
         (
-            Param("file", Kind.STR, f"a plain name that ends in one of {', '.join(SUFFIXES)}", high=NAME_MAX),
+            Param(
+                "file",
+                Kind.STR,
+                f"a plain name that ends in one of {', '.join(SUFFIXES)}",
+                high=NAME_BYTES_MAX,
+            ),
             Param("offset", Kind.INT, "bytes sent before; 0 starts over", "bytes", low=0, high=SIZE_MAX),
             Param("text", Kind.STR, "the text at that offset", high=PART_MAX),
             Param("done", Kind.BOOL, "this is the last part", required=False, default=False),
@@ -73,8 +81,8 @@ class _Uploads:
         try:
             size = await asyncio.to_thread(_write, self._folder, params, part)
         except (OSError, ApiError) as error:
-            if offset == 0 or isinstance(error, _FullError):
-                await self._drop(name, part)
+            if offset == 0 or isinstance(error, _FullError | OSError):
+                await self._drop(name, part)  # what a failed call left of it is not known
             if isinstance(error, ApiError):
                 raise
             raise ApiError("failed", f"{shown(name)} cannot be written: {error.strerror or error}") from None
@@ -144,7 +152,7 @@ def _remove_left(folder: Path) -> None:
     with contextlib.suppress(OSError):  # who writes there says what is wrong
         for path in list(folder.iterdir()):
             name = path.name.removeprefix(".").removesuffix(_PARTIAL)
-            if path.name == _partial_of(name) and name.lower().endswith(SUFFIXES):
+            if path.name == _partial_of(name) and is_job_name(name):
                 _unlink(path)
 
 
@@ -168,7 +176,7 @@ def _write(folder: Path, params: dict[str, Any], part: _Part) -> int:
 def _write_into(directory: int, params: dict[str, Any], part: _Part) -> int:
     name, offset, data = params["file"], params["offset"], params["text"].encode()
     if not params["replace"] and _exists(name, directory):
-        raise ApiError("file_exists", f"{shown(name)} exists already; choose another name, or set replace")
+        raise _exists_error(name)
     if (free := shutil.disk_usage(directory).free) - len(data) < FREE_MIN:
         raise _FullError(free)
     partial = _partial_of(name)
@@ -177,11 +185,33 @@ def _write_into(directory: int, params: dict[str, Any], part: _Part) -> int:
         size = _append(out, name, offset, data)
         if params["done"]:
             os.fsync(out)
-            os.rename(partial, name, src_dir_fd=directory, dst_dir_fd=directory)
+            _show(directory, partial, name, replace=params["replace"])
             part.gone = True
+            os.fsync(directory)
     finally:
         os.close(out)
     return size
+
+
+def _show(directory: int, partial: str, name: str, *, replace: bool) -> None:
+    """Give the file PARTIAL its NAME; raises ApiError where that exists by now, unless REPLACE."""
+    folders = {"src_dir_fd": directory, "dst_dir_fd": directory}
+    if not replace:
+        try:
+            os.link(partial, name, **folders, follow_symlinks=False)
+        except FileExistsError:
+            raise _exists_error(name) from None
+        except OSError as error:
+            if error.errno not in _NO_LINKS:
+                raise
+        else:
+            os.unlink(partial, dir_fd=directory)
+            return
+    os.rename(partial, name, **folders)  # noqa: PTH104 (in an open folder)
+
+
+def _exists_error(name: str) -> ApiError:
+    return ApiError("file_exists", f"{shown(name)} exists already; choose another name, or set replace")
 
 
 def _append(out: int, name: str, offset: int, data: bytes) -> int:
@@ -209,8 +239,5 @@ def _exists(name: str, directory: int) -> bool:
 
 
 def _check_name(name: str) -> None:
-    plain = name.isprintable() and "/" not in name and not name.startswith((".", "-"))
-    if not plain or not name.lower().endswith(SUFFIXES):
-        raise ApiError(
-            "bad_params", f"{shown(name)} must be a plain name that ends in one of {', '.join(SUFFIXES)}"
-        )
+    if not is_job_name(name):
+        raise ApiError("bad_params", f"{shown(name)} must be {RULE}")

@@ -12,6 +12,7 @@ from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.support.quoting import nearest_or_all
 from nodes.devices.tmcuart import TmcUart
+from nodes.support.numbers import read_whole
 
 if TYPE_CHECKING:
     from coordinator.modules.drivers.tmc_driver import TmcDriver
@@ -139,13 +140,9 @@ class TmcCommands(Module):
             raise WordError("SET_TMC_FIELD needs VALUE= or VELOCITY=, one of both")
         if "VELOCITY" in given:
             speed = value(call.command, given, "VELOCITY")
-            number = driver.settings.tstep(speed) if speed > 0 else -1
+            number: int | None = driver.settings.tstep(speed) if speed > 0 else None
         else:
-            text = given["VALUE"]
-            try:
-                number = int(text, 0)
-            except ValueError:
-                number = -1
-        if not 0 <= number <= field.maximum:
+            number = read_whole(given["VALUE"], may_be_hex=True)
+        if number is None or not 0 <= number <= field.maximum:
             raise WordError(f"SET_TMC_FIELD: {field.name} takes whole numbers from 0 to {field.maximum}")
         return number

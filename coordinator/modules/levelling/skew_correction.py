@@ -24,7 +24,7 @@ from coordinator.gcode.commands import (
 )
 from coordinator.gcode.events import Done, PositionSet, WeightsChange
 from coordinator.gcode.parameters import flag, one, value
-from coordinator.gcode.parser import Command, WordError, quoted
+from coordinator.gcode.parser import Command, WordError, command_line, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing import Homing
 from coordinator.runtime.module_context import ModuleContext
@@ -190,7 +190,7 @@ class Skews(Module):
         """The line that restores the skew in effect; empty: nothing is corrected."""
         if self.now == Skew():
             return ""
-        return " ".join((RESTORE, *(f"{plane}={getattr(self.now, plane.lower()):.12g}" for plane in _PLANES)))
+        return command_line(RESTORE, **{plane: getattr(self.now, plane.lower()) for plane in _PLANES})
 
     # ------------------------------------------------------------------------------------------ commands
 

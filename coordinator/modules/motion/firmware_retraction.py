@@ -7,7 +7,7 @@ from typing import Final
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.commands import Call, Immediate, Lines, Reading
 from coordinator.gcode.parameters import bounded
-from coordinator.gcode.parser import WordError
+from coordinator.gcode.parser import WordError, command_line
 from coordinator.modules.base import Build, Module
 from coordinator.support.values import Value
 
@@ -88,14 +88,14 @@ class FirmwareRetraction(Module):
         if self._retracted is not None or s.retract_length == 0:
             return Immediate()
         self._retracted = s
-        hop = [f"SET_GCODE_OFFSET Z_ADJUST={s.z_hop_height:g} MOVE=1"] if s.z_hop_height else []
+        hop = [command_line("SET_GCODE_OFFSET", Z_ADJUST=s.z_hop_height, MOVE=1)] if s.z_hop_height else []
         return self._lines([_extrude(-s.retract_length, s.retract_speed), *hop])
 
     def _unretract(self, _call: Call) -> Reading:
         s, self._retracted = self._retracted, None
         if s is None:
             return Immediate()
-        hop = [f"SET_GCODE_OFFSET Z_ADJUST={-s.z_hop_height:g} MOVE=1"] if s.z_hop_height else []
+        hop = [command_line("SET_GCODE_OFFSET", Z_ADJUST=-s.z_hop_height, MOVE=1)] if s.z_hop_height else []
         now = self._settings
         length = s.retract_length + now.unretract_extra_length
         return self._lines([*hop, _extrude(length, now.unretract_speed)])

@@ -6,7 +6,7 @@ from typing import Final
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parameters import bounded, needed, one
-from coordinator.gcode.parser import Command
+from coordinator.gcode.parser import Command, command_line
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.support.values import Value
@@ -77,7 +77,7 @@ class DelayedGCode(Module):
         if runner is None:
             self._live.say(f"[{self.name}] does not run: only a service (canductor run) runs it")
         else:
-            runner.run_lines(self.name, [f"{_COMMAND} ID={self.id}"])
+            runner.run_lines(self.name, [command_line(_COMMAND, ID=self.id)])
 
 
 class DelayedGCodes(Module):

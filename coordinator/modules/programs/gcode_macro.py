@@ -1,6 +1,7 @@
 """[gcode_macro NAME]: a command that is replaced by lines of g-code, which a template renders."""
 
 import ast
+import math
 import re
 from collections.abc import Mapping
 from typing import Any, Final
@@ -197,11 +198,25 @@ def literal(text: str) -> Any:
     if len(text) > VALUE_MAX:
         raise ValueError(f"is longer than {VALUE_MAX} characters")
     try:
-        return ast.literal_eval(text)
+        value = ast.literal_eval(text)
     except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError):
+        value = ...
+    if not _can_be_kept(value):
         raise ValueError(
             f"is {quoted(text)}, which is no value: write 1, 0.5, True, 'text', [1, 2] or {{'a': 1}}"
-        ) from None
+        )
+    return value
+
+
+def _can_be_kept(value: object) -> bool:
+    """Return whether VALUE reads as itself once it is written; numbers that are not finite do not."""
+    if isinstance(value, float):
+        return math.isfinite(value)
+    if isinstance(value, dict):
+        return all(_can_be_kept(each) for pair in value.items() for each in pair)
+    if isinstance(value, list | tuple | set):
+        return all(map(_can_be_kept, value))
+    return value is None or isinstance(value, bool | int | str)
 
 
 def plain(value: object) -> Value:

@@ -54,7 +54,8 @@ class SaveVariables(Module):
 
     async def connect(self, live: "ModuleContext") -> None:
         """Write the file from now on."""
-        self._writer = _Writer(self.path, live.say)
+        # Its thread must not call whoever listens to notices.
+        self._writer = _Writer(self.path, lambda text: live.soon_on_loop(lambda: live.say(text)))
 
     def close(self) -> None:
         """Wait until all is written."""

@@ -7,6 +7,7 @@ from coordinator.config.options import BoolOption, FloatOption, GCodeOption, Sec
 from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parameters import flag, needed, one
+from coordinator.gcode.parser import command_line
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
@@ -104,11 +105,11 @@ class FilamentSwitchSensor(Module):
         if runner is None:
             return
         if there:
-            runner.run_lines(self.name, [f"{_INSERT} SENSOR={self.id}"], self.insert.text)
+            runner.run_lines(self.name, [command_line(_INSERT, SENSOR=self.id)], self.insert.text)
             return
         live.say(f"{self.name}: the filament has run out")
         lines = ["PAUSE"] if self._pauses and self._can_pause else []
-        runner.run_paused(self.name, [*lines, f"{_RUNOUT} SENSOR={self.id}"], stay=self._pauses)
+        runner.run_paused(self.name, [*lines, command_line(_RUNOUT, SENSOR=self.id)], stay=self._pauses)
 
 
 class FilamentSensors(Module):

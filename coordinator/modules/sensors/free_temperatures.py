@@ -32,6 +32,7 @@ from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
+from nodes.support.numbers import read_whole
 
 LOWEST_C: Final = -273.15
 HIGHEST_C: Final = 1500.0
@@ -146,16 +147,17 @@ class HostTemperature(TemperatureSource):
     def _look(self) -> None:
         try:
             text = self._path.read_text(encoding="ascii", errors="replace")[:64].strip()
-            celsius = int(text) / 1000
         except OSError as error:
             raise CanductorError(
                 f"[{self.name}]: {self._path} cannot be read: {error.strerror}; correct sensor_path"
             ) from None
-        except ValueError:
+        thousandths = read_whole(text)
+        if thousandths is None:
             raise CanductorError(
                 f"[{self.name}]: {self._path} holds {shown(text)}, not thousandths of a °C; correct"
                 " sensor_path"
-            ) from None
+            )
+        celsius = thousandths / 1000
         if self._live is not None:
             self._watch(self._live, celsius)
         self._take(celsius, lambda live: live.print_time_now())

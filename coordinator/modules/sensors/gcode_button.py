@@ -7,6 +7,7 @@ from coordinator.config.options import GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parameters import flag, one
+from coordinator.gcode.parser import command_line
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.support.values import Value
@@ -53,7 +54,9 @@ class GCodeButton(Module):
         if runner is None:
             self._live.say(f"[{self.name}] does nothing: only a service (canductor run) runs its g-code")
             return
-        runner.run_lines(self.name, [f"{_COMMAND} BUTTON={self.id} PRESSED={pressed:d}"], template.text)
+        runner.run_lines(
+            self.name, [command_line(_COMMAND, BUTTON=self.id, PRESSED=int(pressed))], template.text
+        )
 
 
 class GCodeButtons(Module):

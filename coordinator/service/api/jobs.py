@@ -10,9 +10,10 @@ from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.motion import MotionOver
 from coordinator.service.core.work import FileWork
 from coordinator.service.jobs.fed import FAILURE_MAX, NAME_MAX, PIECE_BYTES_MAX, PIECE_LINES_MAX
-from coordinator.service.jobs.job_folder import FILES_MAX, NAME_BYTES_MAX, JobFolder, NoSuchJob
+from coordinator.service.jobs.job_folder import FILES_MAX, JobFolder, NoSuchJob
 from coordinator.service.jobs.jobs import JobPhase, JobRun
 from coordinator.service.state.figures import job_figures
+from coordinator.support.job_names import PATH_BYTES_MAX
 from coordinator.support.values import Value
 
 _LISTED_MAX: Final = 1000
@@ -151,7 +152,7 @@ def job_methods(service: MachineService) -> Iterator[Method]:
         Scope.OPERATE,
         "Print a file of the job folder; its modes begin as a program's do.",
         jobs.start,
-        params=(Param("file", Kind.STR, "as job.list names it", high=NAME_BYTES_MAX),),
+        params=(Param("file", Kind.STR, "as job.list names it", high=PATH_BYTES_MAX),),
         returns=_JOB,
     )
     for name, call, sentence in (

@@ -27,7 +27,7 @@ from coordinator.service.core.programs import Programs
 from coordinator.service.core.tables import TableService
 from coordinator.service.core.work import FileWork
 from coordinator.service.jobs.fed import FedJobs
-from coordinator.service.jobs.job_folder import JobFolder
+from coordinator.service.jobs.job_folder import JobFolder, JobFolderClaim
 from coordinator.service.jobs.jobs import JobPhase, JobRun
 from coordinator.service.jobs.outcome import Outcome, job_progress, outcome_of
 from coordinator.service.jobs.recovery import Recovery
@@ -104,6 +104,7 @@ class MachineService:
         self.log = LogRing(on_line)
         self._on_output = on_output
         self.folder = None if settings.jobs is None else JobFolder(settings.jobs)
+        self._claimed: JobFolderClaim | None = None
         self.machine: Machine | None = None
         self.motion: Motion | None = None
         self.job: JobRun | None = None
@@ -136,7 +137,11 @@ class MachineService:
     # ------------------------------------------------------------------------------------------- life
 
     async def run(self) -> None:
-        """Serve clients until cancelled; when that happens during motion, stop all nodes, as Ctrl-C does."""
+        """Serve clients until cancelled; when that happens during motion, stop all nodes, as Ctrl-C does.
+
+        Raises JobFolderInUse, before anything is done, when another service has the job folder.
+        """
+        self.claim_folder()
         if self.settings.own_process:
             keep_small()
         refresh = asyncio.ensure_future(self._refresh())
@@ -154,6 +159,7 @@ class MachineService:
             await asyncio.gather(refresh, return_exceptions=True)
             await self._let_go()
             await asyncio.to_thread(self.recovery.close)
+            self._unclaim()
 
     async def run_job(
         self,
@@ -375,8 +381,20 @@ class MachineService:
     def job_folder(self, otherwise: Path) -> JobFolder:
         """Return the folder of jobs; the one at OTHERWISE unless the settings name one."""
         if self.folder is None or self.settings.jobs is None:
+            self._unclaim()
             self.folder = JobFolder(otherwise)
+            self.claim_folder()
         return self.folder
+
+    def claim_folder(self) -> None:
+        """Keep other services out of the job folder; raises JobFolderInUse. ``run`` does so, too."""
+        if self.folder is not None and self._claimed is None:
+            self._claimed = JobFolderClaim(self.folder.path)
+
+    def _unclaim(self) -> None:
+        claimed, self._claimed = self._claimed, None
+        if claimed is not None:
+            claimed.close()
 
     # ------------------------------------------------------------------------------------------- state
 

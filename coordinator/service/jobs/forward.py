@@ -9,6 +9,7 @@ from coordinator.gcode.builtins.state import present_state
 from coordinator.gcode.events import Emergency, End
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import SavedState
+from coordinator.gcode.parser import command_line
 from coordinator.gcode.program import Program
 from coordinator.modules.levelling.skew_correction import Skews
 from coordinator.modules.module_set import build_modules
@@ -86,8 +87,12 @@ def _extruder_lines(job: Job) -> list[str]:
     active = job.machine.active
     if active is None:
         return []
-    advance = f"ADVANCE={active.pressure_advance_s:.9g} SMOOTH_TIME={active.smooth_s:.9g}"
     return [
-        f"ACTIVATE_EXTRUDER EXTRUDER={active.name}",
-        f"SET_PRESSURE_ADVANCE EXTRUDER={active.name} {advance}",
+        command_line("ACTIVATE_EXTRUDER", EXTRUDER=active.name),
+        command_line(
+            "SET_PRESSURE_ADVANCE",
+            EXTRUDER=active.name,
+            ADVANCE=active.pressure_advance_s,
+            SMOOTH_TIME=active.smooth_s,
+        ),
     ]

@@ -1,23 +1,21 @@
 """The job folder: the only files that clients can have printed, whatever names they send."""
 
 import contextlib
+import fcntl
 import os
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
-from io import FileIO
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Final
 
-from coordinator.gcode.program import Program
+from coordinator.gcode.program import Program, UnchangedFile
+from coordinator.support.job_names import DEPTH_MAX, is_job_name, is_plain_part, job_path_parts
 from nodes.support.errors import CanductorError
 
-DEPTH_MAX: Final = 8
 FILES_MAX: Final = 10_000
 """Looked at for one list."""
-NAME_BYTES_MAX: Final = 1024
 _NO_LINK: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
-SUFFIXES: Final = (".gcode", ".gco", ".g", ".nc", ".ngc")
 
 
 class NoSuchJob(CanductorError):  # noqa: N818
@@ -33,6 +31,40 @@ class JobFile:
     size_bytes: int
     modified_s: float
     """Since the epoch."""
+
+
+class JobFolderInUse(CanductorError):  # noqa: N818
+    """Another service has the job folder."""
+
+
+class JobFolderClaim:
+    """Makes the job folder PATH this service's until ``close``; raises JobFolderInUse.
+
+    Two services would remove each other's uploads and overwrite each other's journal. The lock ends with the
+    process, however that ends. A disk without locks, or no folder, is no reason to refuse.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._fd: int | None = None
+        with contextlib.suppress(OSError):
+            self._fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        if self._fd is None:
+            return
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.close()
+            raise JobFolderInUse(
+                f"the job folder {path} is used by another service; end that one, or use another folder"
+            ) from None
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        """Let others have it."""
+        fd, self._fd = self._fd, None
+        if fd is not None:
+            os.close(fd)
 
 
 class JobFolder:
@@ -76,25 +108,19 @@ class JobFolder:
                 raise NoSuchJob(
                     f"there is no file {_shown(name)} in the job folder; job.list returns those that exist"
                 ) from None
-        status = os.fstat(fd)
-        if not stat.S_ISREG(status.st_mode):
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
             raise NoSuchJob(f"{_shown(name)} in the job folder is not a file")
-        return Program(FileIO(fd), "/".join(parts), size_bytes=status.st_size, modified_ns=status.st_mtime_ns)
+        clean = "/".join(parts)
+        source = UnchangedFile(fd, clean)
+        status = source.status
+        return Program(source, clean, size_bytes=status.st_size, modified_ns=status.st_mtime_ns)
 
 
 def _parts(name: str) -> tuple[str, ...]:
     """Return the parts of a clean relative path; raises NoSuchJob for any other."""
-    parts = PurePosixPath(name).parts
-    odd = (
-        not parts
-        or len(parts) > DEPTH_MAX
-        or len(name.encode(errors="surrogatepass")) > NAME_BYTES_MAX
-        or not name.isprintable()
-        or "\\" in name
-        or any(part in ("..", "/", "//") or part.startswith(".") for part in parts)
-    )
-    if odd:
+    parts = job_path_parts(name)
+    if not parts:
         raise NoSuchJob(
             f"{_shown(name)} is not the name of a job; use the name of a file as job.list returns it"
         )
@@ -114,13 +140,13 @@ def _walk(root: int) -> Iterator[tuple[str, list[str], int]]:
     for folder, folders, names, fd in os.fwalk(".", dir_fd=root, follow_symlinks=False):
         clean = folder[2:] if folder.startswith("./") else ""
         depth = clean.count("/") + 1 if clean else 0
-        folders[:] = [] if depth >= DEPTH_MAX - 1 else [f for f in folders if not f.startswith(".")]
+        folders[:] = [] if depth >= DEPTH_MAX - 1 else list(filter(is_plain_part, folders))
         yield clean, names, fd
 
 
 def _jobs_of(folder: str, names: list[str], fd: int) -> Iterator[JobFile]:
     for name in names:
-        if name.startswith(".") or not name.lower().endswith(SUFFIXES) or not name.isprintable():
+        if not is_job_name(name):
             continue
         try:
             status = os.stat(name, dir_fd=fd, follow_symlinks=False)

@@ -2,19 +2,23 @@
 
 One small file in the job folder. Each entry is a line of JSON, appended by a thread of its own and brought to
 the disk every SYNC_S; a power cut costs the last entries and nothing else. A file beyond FILE_BYTES_MAX is
-written again with what still counts: its head and its newest entry.
+written again with what still counts: its head and its newest entry. So is one whose last entry could not be
+written: half an entry must not spoil the next one.
 """
 
+import contextlib
 import json
+import math
 import os
 import queue
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.support.atomic_file import atomic_write
+from coordinator.support.atomic_file import atomic_write, sync_folder
 
 NAME: Final = ".canductor-journal"
 ENTRY_S: Final = 1.0
@@ -23,6 +27,9 @@ SYNC_S: Final = 2.0
 FILE_BYTES_MAX: Final = 262_144
 WAITING_MAX: Final = 64
 _VERSION: Final = 1
+_INT_END: Final = 2**63
+_NUMBER_END: Final = 1e9
+"""Of offsets, factors, temperatures and heights."""
 
 
 @dataclass(frozen=True)
@@ -59,19 +66,47 @@ def read_journal(path: Path) -> Interrupted | None:
             head, last = entry, {}
         else:
             last = entry
-    try:
-        if head is None or head["journal"] != _VERSION or int(last.get("line", 0)) < 1:
-            return None
-        return Interrupted(
-            str(head["file"]),
-            int(head["size"]),
-            int(head["modified_ns"]),
-            int(last["line"]),
-            last,
-            fed=head.get("fed") is True,
-        )
-    except (KeyError, TypeError, ValueError):
+    return None if head is None else _interrupted(head, last)
+
+
+def _interrupted(head: Mapping[str, Any], last: Mapping[str, Any]) -> Interrupted | None:
+    """Return what HEAD and the LAST entry say; None unless each value has its type and its range.
+
+    The file is in a folder that others may write to.
+    """
+    file = head.get("file")
+    numbers = [head.get("size"), head.get("modified_ns"), last.get("line")]
+    size, modified_ns, line = (n if type(n) is int and n < _INT_END else -1 for n in numbers)
+    if head.get("journal") != _VERSION or not isinstance(file, str) or min(size, modified_ns) < 0:
         return None
+    if line < 1 or not _is_sound(last):
+        return None
+    return Interrupted(file, size, modified_ns, line, last, fed=head.get("fed") is True)
+
+
+def _is_sound(held: Mapping[str, Any]) -> bool:
+    """Return whether all in HELD can be used as what ``note`` got."""
+    lists = {"offset": 4, "z": 2}
+    return (
+        all(_is_number(held.get(name, 1.0)) for name in ("speed_factor", "extrude_factor"))
+        and all(
+            held.get(name) is None
+            or (
+                isinstance(held[name], list) and len(held[name]) == count and all(map(_is_number, held[name]))
+            )
+            for name, count in lists.items()
+        )
+        and all(
+            isinstance(held.get(name, {}), dict) and all(map(_is_number, held.get(name, {}).values()))
+            for name in ("heaters", "fans")
+        )
+        and isinstance(held.get("excluded", []), list)
+        and all(isinstance(name, str) for name in held.get("excluded", []))
+    )
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value) and abs(value) < _NUMBER_END  # type: ignore[arg-type]
 
 
 def _entry(line: bytes) -> dict[str, Any] | None:
@@ -83,12 +118,20 @@ def _entry(line: bytes) -> dict[str, Any] | None:
 
 
 class Journal:
-    """Writes the journal at PATH. ON_FAILURE gets a sentence, once."""
+    """Writes the journal at PATH. ON_FAILURE gets a sentence, once. CLOCK_S is monotonic, in s."""
 
-    def __init__(self, path: Path, on_failure: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        on_failure: Callable[[str], None],
+        *,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._path = path
         self._on_failure = on_failure
-        self._waiting: queue.Queue[dict[str, Any] | None] = queue.Queue(WAITING_MAX)
+        self._clock_s = clock_s
+        self._waiting: queue.Queue[tuple[float, dict[str, Any]] | None] = queue.Queue()
+        """Entries, and when each came."""
         self._failed = False
         self.left_out = 0
         """Entries for which there was no room: the disk is slow."""
@@ -114,47 +157,57 @@ class Journal:
         self._thread.join()
 
     def _put(self, entry: dict[str, Any]) -> None:
-        try:
-            self._waiting.put_nowait(entry)
-        except queue.Full:
+        """Have ENTRY written; a slow disk may cost lines of a job, but never its begin or its end."""
+        if "line" in entry and self._waiting.qsize() >= WAITING_MAX:
             self.left_out += 1
+        else:
+            self._waiting.put((self._clock_s(), entry))
 
     # ------------------------------------------------------------------------------------- the thread
 
     def _run(self) -> None:
-        head: dict[str, Any] = {}
+        head: dict[str, Any] | None = None  # of the job that goes on
         size = FILE_BYTES_MAX  # an existing file is replaced
-        unsynced = False
+        unsynced_s: float | None = None  # since when
         while True:
             try:
-                entry = self._waiting.get(timeout=SYNC_S if unsynced else None)
+                found = self._waiting.get(timeout=None if unsynced_s is None else SYNC_S)
             except queue.Empty:
-                self._sync()
-                unsynced = False
+                size, unsynced_s = self._sync(size), None
                 continue
-            if entry is None:
-                self._sync()
+            if found is None:
+                self._sync(size)
                 return
+            at_s, entry = found
             if "file" in entry:
                 head = entry
             try:
                 size = self._write(head, entry, size)
-                unsynced = True
+                unsynced_s = at_s if unsynced_s is None else unsynced_s
             except OSError as error:
                 self._fail(error)
+                size = FILE_BYTES_MAX
+            over = entry.get("ended") is True
+            if size == FILE_BYTES_MAX and (over or entry is head):
+                self._remove()  # what it says of an earlier job, or of this one, does not hold any more
+            if over:
+                head = None
+            if unsynced_s is not None and at_s >= unsynced_s + SYNC_S:
+                size, unsynced_s = self._sync(size), None
 
-    def _write(self, head: dict[str, Any], entry: dict[str, Any], size: int) -> int:
+    def _write(self, head: dict[str, Any] | None, entry: dict[str, Any], size: int) -> int:
         """Write ENTRY and return how large the file is then."""
         text = json.dumps(entry, separators=(",", ":")) + "\n"
         if entry is head or size + len(text) > FILE_BYTES_MAX:
-            whole = text if entry is head else json.dumps(head) + "\n" + text
+            whole = text if entry is head or head is None else json.dumps(head) + "\n" + text
             atomic_write(self._path, whole.encode())
             return len(whole)
         with self._path.open("a", encoding="utf-8") as file:
             file.write(text)
         return size + len(text)
 
-    def _sync(self) -> None:
+    def _sync(self, size: int) -> int:
+        """Bring the file of SIZE to the disk; return its size, FILE_BYTES_MAX if it must be written again."""
         try:
             fd = os.open(self._path, os.O_RDONLY)
             try:
@@ -163,8 +216,16 @@ class Journal:
                 os.close(fd)
         except FileNotFoundError:
             pass  # nothing was ever written
-        except OSError as error:
+        except OSError as error:  # what was appended may be lost, even if the next fsync succeeds
             self._fail(error)
+            return FILE_BYTES_MAX
+        return size
+
+    def _remove(self) -> None:
+        """Remove the file where it cannot be written: that takes no space."""
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+            sync_folder(self._path.parent)
 
     def _fail(self, error: OSError) -> None:
         if not self._failed:

@@ -13,6 +13,7 @@ from typing import Any, Final
 from coordinator.gcode.builtins.state import come_back
 from coordinator.gcode.commands import Recovering
 from coordinator.gcode.events import Event, Full, Notice
+from coordinator.gcode.parser import WordError, command_line
 from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.levelling.bed_mesh import RESTORE, BedMesh
@@ -107,7 +108,15 @@ class Recovery:
             return
         path = folder.path / NAME
         self._show(read_journal(path))
-        self._journal = Journal(path, lambda text: self._service.log.add("notice", text))
+        loop = asyncio.get_running_loop()
+
+        def report(
+            text: str,
+        ) -> None:  # in the journal's thread: no place for the log's listeners
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self._service.log.add, "notice", text)
+
+        self._journal = Journal(path, report)
         if (found := self.interrupted) is not None:
             what_next = (
                 "its lines came from a client, which has to begin it again"
@@ -186,10 +195,12 @@ class Recovery:
         """Go on with the interrupted job; raises ApiError, MotionOver."""
         service = self._service
         found, motion = self._ready(how)
-        hot, blown = self._heating(found)
         try:
+            hot, blown = self._heating(found)
             work = await asyncio.to_thread(self._prepare, found, how.line or found.line)
-        except CanductorError as error:
+        except ApiError:
+            raise
+        except (CanductorError, WordError) as error:
             raise ApiError("failed", f"{found.file} cannot go on: {error}") from None
         with contextlib.ExitStack() as unless_done:
             unless_done.callback(work.program.close)
@@ -275,11 +286,15 @@ class Recovery:
         lines: list[str] = []
         for some in (False, True):
             chosen = {name: t for name, t in heaters.items() if name.startswith("extruder") is some}
-            lines += [f"SET_HEATER_TEMPERATURE HEATER={name} TARGET={t:g}" for name, t in chosen.items()]
-            lines += [f"TEMPERATURE_WAIT SENSOR={name} MINIMUM={t - NEAR_K:g}" for name, t in chosen.items()]
+            lines += [command_line("SET_HEATER_TEMPERATURE", HEATER=n, TARGET=t) for n, t in chosen.items()]
+            lines += [
+                command_line("TEMPERATURE_WAIT", SENSOR=n, MINIMUM=t - NEAR_K) for n, t in chosen.items()
+            ]
         fans = found.held.get("fans", {})
         blown = [
-            f"M106 S{speed * 255:.4f}" if name == "fan" else f"SET_FAN_SPEED FAN={name} SPEED={speed:g}"
+            f"M106 S{speed * 255:.4f}"
+            if name == "fan"
+            else command_line("SET_FAN_SPEED", FAN=name, SPEED=speed)
             for name, speed in (fans.items() if isinstance(fans, dict) else ())
             if known("M106" if name == "fan" else "SET_FAN_SPEED")
         ]

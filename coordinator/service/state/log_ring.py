@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from coordinator.gcode.reply_kinds import ReplyKind
+from nodes.support.terminal import printable_lines
 
 KEEP: Final = 1000
 TEXT_MAX: Final = 2000
@@ -26,7 +27,12 @@ class LogRing:
         """Add a line of KIND: state, notice, reply or stop; OUTPUT: it answers g-code, and how it reads."""
         self.count += 1
         at = datetime.now(UTC).isoformat(timespec="milliseconds")
-        entry: Entry = {"number": self.count, "time": at, "kind": kind, "text": text[:TEXT_MAX]}
+        entry: Entry = {
+            "number": self.count,
+            "time": at,
+            "kind": kind,
+            "text": printable_lines(text[:TEXT_MAX]),
+        }
         if output is not None:
             entry = {**entry, "output": str(output)}
         self._lines.append(entry)

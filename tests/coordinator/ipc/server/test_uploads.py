@@ -1,6 +1,7 @@
 """Files that clients begin to send and do not end."""
 
 import asyncio
+import os
 import shutil
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.server.uploads import FREE_MIN, PARTS_MAX, upload_method
+from coordinator.ipc.protocol.methods import ApiError
+from coordinator.ipc.server.uploads import FREE_MIN, PARTS_MAX, _show, upload_method
 from tests.coordinator.ipc.served import Script, Served, serving
 from tests.stages import jump_loop
 
@@ -106,3 +108,18 @@ def test_what_a_killed_service_left_is_removed_and_nothing_else(tmp_path: Path) 
         assert names(jobs) == sorted(kept)
 
     run(tmp_path, body)
+
+
+def test_a_file_that_appears_at_the_last_moment_stays(tmp_path: Path) -> None:
+    """Failed before: between the look and the rename it was overwritten."""
+    (tmp_path / ".a.gcode.part").write_text("new")
+    (tmp_path / "a.gcode").write_text("old")
+    folder = os.open(tmp_path, os.O_RDONLY)
+    try:
+        with pytest.raises(ApiError, match="exists already"):
+            _show(folder, ".a.gcode.part", "a.gcode", replace=False)
+        assert (tmp_path / "a.gcode").read_text() == "old"
+        _show(folder, ".a.gcode.part", "a.gcode", replace=True)
+    finally:
+        os.close(folder)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a.gcode": "new"}

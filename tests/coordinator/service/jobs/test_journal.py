@@ -56,7 +56,14 @@ def test_wherever_it_is_cut_off_it_tells_an_earlier_line_or_none(tmp_path: Path)
     "text", ["", "nonsense", "[1]\n{}", '{"journal":2,"file":"a","size":1,"modified_ns":1}\n{"line":3}',
              '{"journal":1,"file":"a"}\n{"line":3}', '{"line":3}',
              '{"journal":1,"file":"a","size":"x","modified_ns":1}\n{"line":3}',
-             '{"journal":1,"file":"a","size":1,"modified_ns":1}\n{"line":"x"}', "[" * 100_000],
+             '{"journal":1,"file":"a","size":1,"modified_ns":1}\n{"line":"x"}', "[" * 100_000,
+             *(f'{{"journal":1,"file":"a","size":{size},"modified_ns":1}}\n{{"line":3}}'
+               for size in ("Infinity", "NaN", "true", "1.5", "-1", "1" * 30)),
+             '{"journal":1,"file":["a"],"size":1,"modified_ns":1}\n{"line":3}',
+             *(f'{{"journal":1,"file":"a","size":1,"modified_ns":1}}\n{{"line":3,"{name}":{value}}}'
+               for name, value in (("speed_factor", '"x"'), ("speed_factor", "Infinity"), ("offset", "[1]"),
+                                   ("offset", '["x",0,0,0]'), ("z", "[1,NaN]"), ("heaters", '{"bed":"60"}'),
+                                   ("heaters", '{"bed":Infinity}'), ("fans", "[1]"), ("excluded", "[1]")))],
 )  # fmt: skip
 def test_what_is_no_journal_tells_nothing(tmp_path: Path, text: str) -> None:
     path = tmp_path / NAME

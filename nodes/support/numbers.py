@@ -1,0 +1,34 @@
+"""Numbers that were written by people, programs or other computers: one reader for G-code, options and files.
+
+Python's ``float`` and ``int`` also read digits of other scripts, ``1_000``, ``inf``, ``nan`` and any length.
+"""
+
+import re
+from typing import Final
+
+CHARS_MAX: Final = 40
+MAGNITUDE_MAX: Final = 1e15
+"""Beyond it a float does not hold every whole number, and nothing here is that large."""
+_DECIMAL: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_WHOLE: Final = re.compile(r"[+-]?\d+", re.ASCII)
+_HEX: Final = re.compile(r"0[xX][0-9a-fA-F]+", re.ASCII)
+
+
+def read_decimal(text: str) -> float | None:
+    """Return the decimal number in TEXT, from -MAGNITUDE_MAX to MAGNITUDE_MAX; None: there is none."""
+    if (
+        len(text) > CHARS_MAX
+        or not _DECIMAL.fullmatch(text)
+        or not abs(value := float(text)) <= MAGNITUDE_MAX
+    ):
+        return None
+    return value
+
+
+def read_whole(text: str, *, may_be_hex: bool = False) -> int | None:
+    """Return the whole number that TEXT is; None: it is none. MAY_BE_HEX: also as in 0x1f."""
+    if len(text) > CHARS_MAX:
+        return None
+    if may_be_hex and _HEX.fullmatch(text):
+        return int(text, 16)
+    return int(text) if _WHOLE.fullmatch(text) else None

@@ -1,0 +1,61 @@
+"""Numbers from outside: every way in reads the same, and nothing that is no plain finite number."""
+
+import math
+from argparse import ArgumentTypeError
+from collections.abc import Callable
+from typing import Final
+
+import pytest
+
+from coordinator.cli.commands.demo import _ppm
+from coordinator.config.options import BadValue, FloatOption, IntOption
+from coordinator.gcode.parser import WordError, number
+from coordinator.modules.programs.gcode_macro import literal
+from nodes.support.numbers import read_decimal, read_whole
+from nodes.support.option_values import UsageError, parse_float, parse_hex, parse_int, parse_ratio
+
+NO_NUMBERS: Final = ("", "nan", "inf", "-Infinity", "1_0", "١٢", "1e999", "1e16", "0x", "1e", "--1", "1 2",
+                     "1" * 41, "1.5.", "½", "１")  # fmt: skip # noqa: RUF001
+NUMBERS: Final = {"0": 0.0, "-1.5": -1.5, "+.5": 0.5, "2.": 2.0, "1e3": 1000.0, "12E-1": 1.2}
+WAYS_IN: Final[dict[str, Callable[[str], object]]] = {
+    "G-code, macros' results": lambda text: number("M104", {"S": text}, "S"),
+    "configuration": FloatOption(name="x", help="").parse,
+    "configuration, whole": IntOption(name="x", help="").parse,
+    "command line": lambda text: parse_float(text, -1e15, 1e15),
+    "command line, whole": parse_int,
+    "command line, hex": lambda text: parse_hex(text, 2**32),
+    "command line, ratio": parse_ratio,
+    "command line, ppm": _ppm,
+    "files": read_decimal,
+}
+REFUSED: Final = (WordError, BadValue, UsageError, ValueError, ArgumentTypeError)
+
+
+@pytest.mark.parametrize("way_in", WAYS_IN)
+def test_what_is_no_number_is_refused(way_in: str) -> None:
+    """Failed before for G-code and the command line: they read other scripts' digits and 1_0."""
+    for text in NO_NUMBERS:
+        try:
+            found = WAYS_IN[way_in](text)
+        except REFUSED:
+            continue
+        assert found is None, text
+
+
+def test_what_is_a_number_is_the_same_everywhere() -> None:
+    for text, expected in NUMBERS.items():
+        assert read_decimal(text) == expected
+        assert number("M104", {"S": text}, "S") == expected
+        assert FloatOption(name="x", help="").parse(text) == expected
+        assert parse_float(text, -1e15, 1e15) == expected
+    assert [read_whole("0x1F", may_be_hex=True), read_whole("0x1F"), read_whole("-7")] == [31, None, -7]
+
+
+@pytest.mark.parametrize(
+    "text", ["1e999", "-1e999", "[1, 1e999]", "{'a': 1e999}", "...", "1e999-1e999", "1+2j", "b'x'"]
+)
+def test_a_saved_variable_can_be_read_again(text: str) -> None:
+    """Failed before: ``inf`` and ``Ellipsis`` were written into the file, and the next start refused it."""
+    with pytest.raises(ValueError, match="no value"):
+        literal(text)
+    assert math.isfinite(literal("1e300"))
