@@ -21,6 +21,13 @@ def shown_path(path: str) -> str:
     return f"'{line}'" if len(line) <= _SHOWN_PATH_CHARS else f"'…{line[-_SHOWN_PATH_CHARS:]}'"
 
 
+def printable(line: str) -> str:
+    """Return LINE with a space for each tab and ? for what controls a terminal or nobody can print."""
+    if line.isprintable():
+        return line
+    return "".join(c if c.isprintable() else " " if c == "\t" else "?" for c in line)
+
+
 def nearest(word: str, valid: Iterable[str], *, pattern: str = "{}") -> str:
     """Return "; did you mean …?" when one of the valid names looks like the word, else nothing."""
     if len(word) > _SHOWN_CHARS:

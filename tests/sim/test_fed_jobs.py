@@ -10,7 +10,7 @@ import pytest
 
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.service.jobs.fed import LINES_AHEAD_MAX
-from coordinator.service.jobs.journal import NAME, Journal
+from coordinator.service.jobs.journal import Journal, journal_path
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from tests.stages.served import Served, running
@@ -231,7 +231,9 @@ def test_what_is_refused(tmp_path: Path) -> None:
 
 def test_after_a_crash_it_is_told_and_cannot_be_recovered(tmp_path: Path) -> None:
     (tmp_path / "jobs").mkdir()
-    journal = Journal(tmp_path / "jobs" / NAME, lambda _: None)
+    path = journal_path(tmp_path / "state", tmp_path / "jobs")
+    path.parent.mkdir()
+    journal = Journal(path, lambda _: None)
     journal.begin("JOB", 0, 0, fed=True)
     journal.note(17, {})
     journal.close()
