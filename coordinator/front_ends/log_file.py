@@ -41,7 +41,17 @@ _SHOWN: Final = (
 )
 """Fields of the state tree that go into statistics."""
 _HEAT: Final = (".temperature", ".target", ".power")
-_QUIET: Final = (".state_text", ".failure", ".histogram", ".lead_histogram", ".name", ".uuid")
+_QUIET: Final = (
+    ".bus",
+    ".nodeid",
+    ".policy",
+    ".state_text",
+    ".failure",
+    ".histogram",
+    ".lead_histogram",
+    ".name",
+    ".uuid",
+)
 
 Text = Callable[[], str]
 """Returns lines; called in the thread."""

@@ -141,7 +141,7 @@ def test_a_demo_is_served_announced_and_seen_to_go(tmp_path: Path) -> None:
         command.end()
     asyncio.run(announced(None))
     assert not link.is_symlink()
-    assert "shutdown: emergency stop by a test" in log.read_text(encoding="utf-8")
+    assert "shutdown: emergency stop by 'a test'" in log.read_text(encoding="utf-8")
 
 
 def until_ok(port: int) -> str:
