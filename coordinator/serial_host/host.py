@@ -3,8 +3,8 @@
 import asyncio
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Mapping
-from typing import Final
+from collections.abc import Callable, Coroutine, Iterator, Mapping
+from typing import Any, Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.klippy_api.script import run_lines
@@ -18,6 +18,9 @@ from nodes.support.errors import CanductorError
 WHO: Final = "M112 of the serial host"
 BUSY_S: Final = 2.0
 """A host that waits for a line hears that often that it is being done."""
+AHEAD_MAX: Final = 64
+"""Moves that are acknowledged before they are read: the feeder takes what waits every 50 ms."""
+_MOVES: Final = frozenset(("G0", "G1", "G2", "G3"))
 _WITH_OK: Final[Mapping[str, re.Pattern[str]]] = {
     "M105": re.compile(r"(?:T\d*|B|C):"),
     "M115": re.compile(r"FIRMWARE_NAME:"),
@@ -46,6 +49,12 @@ class SerialHost:
         """Being carried out."""
         self._with_ok = ""
         """What goes with the ``ok`` of that line."""
+        self._ahead: list[str] = []
+        """Moves that are acknowledged and not handed over."""
+        self._moving: asyncio.Task[None] | None = None
+        """Hands them over."""
+        self._room = asyncio.Event()
+        """Set when there is room among those."""
         self._state = service.state
         self._work: asyncio.Task[None] | None = None
 
@@ -55,13 +64,16 @@ class SerialHost:
 
     async def close(self) -> None:
         """End; a line that is being carried out is ended before its next step."""
-        if self._work is not None:
-            self._work.cancel()
-            await asyncio.gather(self._work, return_exceptions=True)
+        for task in (self._work, self._moving):
+            if task is not None:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
 
     def receive(self, data: bytes) -> None:
         """Take what the host has sent; M112 in it stops the machine before this returns."""
         if self.protocol.receive(data):
+            self._ahead.clear()
+            self._room.set()
             self._service.emergency_stop(WHO)
         self._more.set()
 
@@ -104,17 +116,46 @@ class SerialHost:
                 continue
             line = self._line
             with self._busy():
-                try:
-                    await self._do(line)
-                except (CanductorError, ValueError) as error:  # ValueError: a line that nobody can read
-                    self._say(line_of(ReplyKind.ERROR, str(error)))
-                except Exception as bug:  # noqa: BLE001 (a bug of one command must not end the machine)
-                    self._loop.call_exception_handler(
-                        {"message": f"canductor: {line.name} of the serial host failed", "exception": bug}
-                    )
-                    self._say(line_of(ReplyKind.ERROR, f"{line.name} failed by a mistake of the program"))
+                if line.name in _MOVES and state_of(self._service)[0] == "ready":
+                    await self._move(line)
+                else:
+                    await self._moved()
+                    await self._shown(line.name, self._do(line))
             self.protocol.answer(self._with_ok)
             self._write()
+
+    async def _shown(self, name: str, work: Coroutine[Any, Any, None]) -> None:
+        """Have WORK done, and show why it fails."""
+        try:
+            await work
+        except (CanductorError, ValueError) as error:  # ValueError: a line that nobody can read
+            self._say(line_of(ReplyKind.ERROR, str(error)))
+        except Exception as bug:  # noqa: BLE001 (a bug of one command must not end the machine)
+            self._loop.call_exception_handler(
+                {"message": f"canductor: {name} of the serial host failed", "exception": bug}
+            )
+            self._say(line_of(ReplyKind.ERROR, f"{name} failed by a mistake of the program"))
+
+    async def _move(self, line: HostLine) -> None:
+        """Take a move; return when there is room for it."""
+        while len(self._ahead) >= AHEAD_MAX:
+            self._room.clear()
+            await self._room.wait()
+        self._ahead.append(line.text)
+        if self._moving is None or self._moving.done():
+            self._moving = self._loop.create_task(self._hand_over())
+
+    async def _hand_over(self) -> None:
+        """Hand over the moves that were acknowledged, all at once; an error ends those behind it."""
+        while self._ahead:
+            texts, self._ahead = self._ahead, []
+            self._room.set()
+            await self._shown("a move", run_lines(self._service, texts, self._say))
+
+    async def _moved(self) -> None:
+        """Wait until all acknowledged moves are read."""
+        if self._moving is not None:
+            await asyncio.wait((self._moving,))
 
     async def _do(self, line: HostLine) -> None:
         if line.refusal:

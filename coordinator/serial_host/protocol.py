@@ -169,7 +169,7 @@ def _host_line(line: bytes) -> HostLine:
     try:
         command = parse(line)
     except WordError:
-        return HostLine(text, text.split(maxsplit=1)[0].upper())  # the machine says what is wrong with it
+        return HostLine(text, "")  # the machine says what is wrong with it
     if command is None or command.name == EMERGENCY:  # which is carried out when it comes
         return HostLine("", "")
     return HostLine(text, command.name)
