@@ -18,7 +18,7 @@ ROOMS = {
     "coordinator": (
         *("support", "drivers", "motion", "heat", "kinematics", "ipc", "config", "gcode", "web", "metrics"),
         *("tables", "dnc", "runtime", "modules", "assembly", "streaming", "planning", "virtual_machine"),
-        *("service", "verification", "klippy_api", "simulate", "front_ends", "demo", "cli"),
+        *("service", "verification", "klippy_api", "serial_host", "simulate", "front_ends", "demo", "cli"),
     ),
 }
 """The rooms of each package: a room imports itself and those before it."""

@@ -21,6 +21,7 @@ def serve_demo(options: DemoOptions, serving: ServeOptions) -> Report:
         tempfile.TemporaryDirectory(prefix="canductor-demo-") as folder,
         VirtualMachine(description, dataclasses.replace(options, logs=False), Path(folder)) as stage,
     ):
+        serving = dataclasses.replace(serving, state=Path(folder) / "state")
         return serve(lambda: stage.description, with_jobs(serving, description, Path(folder)))
 
 
@@ -33,7 +34,7 @@ def with_jobs(options: ServeOptions, description: MachineDescription, folder: Pa
 
 
 def _demo_jobs(folder: Path) -> Path:
-    """Return a job folder with the demo's program, for this run: a service writes its journal there."""
+    """Return a job folder with the demo's program, for this run."""
     jobs = folder / "jobs"
     jobs.mkdir()
     shutil.copy(DEMO_GCODE, jobs)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
+from coordinator.front_ends.log_file import ServiceLog
 from coordinator.front_ends.stop_path import StopPath
 from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
 from coordinator.ipc.discovery.announcer_process import AnnouncerProcess
@@ -24,6 +25,7 @@ from coordinator.ipc.server.uploads import upload_method
 from coordinator.klippy_api.gateway import Gateway
 from coordinator.metrics.server import MetricsServer, MetricsSettings
 from coordinator.runtime.linux_host import LinuxHost
+from coordinator.serial_host.terminal import PseudoTerminal
 from coordinator.service.api.methods import add_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.core.typed import Typed
@@ -76,6 +78,12 @@ class ServeOptions:
     """The configuration file, for clients that show where it is."""
     klippy_api: Path | None = None
     """The Unix socket for Moonraker (docs/klippy-api.md); None: there is none."""
+    pty: Path | None = None
+    """The link to a pseudo-terminal for a serial host (docs/pty.md); None: there is none."""
+    log_file: Path | None = None
+    """The file that the log is written to; None: there is none."""
+    state: Path | None = None
+    """Folder of what outlives the service, such as the journal of jobs; None: that of this user's machine."""
     metrics_open: bool = False
     """Whether others than this computer may read them."""
 
@@ -119,6 +127,8 @@ class _ServiceProcess:
         self._cache = cache
         self._announcer: AnnouncerProcess | None = None
         self._gateway: Gateway | None = None
+        self._terminal: PseudoTerminal | None = None
+        self._log_file: ServiceLog | None = None
 
     async def serve(self) -> None:
         """Serve front ends until cancelled."""
@@ -128,6 +138,7 @@ class _ServiceProcess:
             jobs=self._options.jobs,
             node_commands=self._options.node_commands,
             tables=table_folder(self._options.name),
+            state=self._options.state or state_folder(self._options.name),
             own_process=True,
         )
         service = MachineService(
@@ -152,6 +163,9 @@ class _ServiceProcess:
         )
         page = self._page(registry, service)
         async with contextlib.AsyncExitStack() as stack:
+            if self._options.log_file is not None:
+                self._log_file = ServiceLog(service, self._options.config, self._options.log_file)
+                stack.push_async_callback(self._log_file.close)
             stack.callback(stop_path.close)
             if page is not None:
                 stack.push_async_callback(page.close)
@@ -162,6 +176,7 @@ class _ServiceProcess:
             self._report_addresses(page)
             await self._open_metrics(tree, stack)
             await self._open_klippy_api(service, stop_path.lane, stack)
+            self._open_terminal(service, stop_path.lane, stack)
             self._announce(service, stack)
             if sys.stdin is not None and sys.stdin.isatty():
                 typed = Typed(service, _print)
@@ -197,10 +212,24 @@ class _ServiceProcess:
             self._options.config,
             on_notice=lambda text: service.log.add("notice", text),
             stop_lane=stop_lane,
+            log_file=self._options.log_file,
         )
         await self._gateway.start(path)
         stack.push_async_callback(self._gateway.close)
         _print(f"serving Moonraker at {path}")
+
+    def _open_terminal(
+        self, service: MachineService, stop_lane: StopLane, stack: contextlib.AsyncExitStack
+    ) -> None:
+        """Serve a serial host if asked for; raises CanductorError."""
+        path = self._options.pty
+        if path is None:
+            return
+        self._terminal = PseudoTerminal(service, path)
+        self._terminal.start()
+        stack.push_async_callback(self._terminal.close)
+        stop_lane.look_also(self._terminal.find_stop)
+        _print(f"serving a serial host at {path}")
 
     def _page(self, registry: Registry, service: MachineService) -> WebServer | None:
         """Return the live page if it is asked for, with its methods in REGISTRY."""
@@ -262,6 +291,10 @@ class _ServiceProcess:
         _print(str(entry["text"]))
         if self._gateway is not None:
             self._gateway.note(entry)
+        if self._terminal is not None:
+            self._terminal.host.note(entry)
+        if self._log_file is not None:
+            self._log_file.note(entry)
         if self._announcer is not None and entry["kind"] == "state":
             self._announcer.set_state(str(service.state))
 

@@ -4,25 +4,23 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.gcode.commands import Call, Immediate
-from coordinator.gcode.parser import WordError, parse
+from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.klippy_api.client import REMOTE_METHODS_MAX, Client
 from coordinator.klippy_api.params import RequestError, objects_param, template_param, text_param
+from coordinator.klippy_api.script import run_lines
 from coordinator.klippy_api.status import StatusBuilder, state_of
 from coordinator.klippy_api.subscription import Subscription, select_fields
 from coordinator.klippy_api.wire import Request
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.levelling.bed_mesh import BedMesh
 from coordinator.modules.programs.pause_resume import PauseResume
-from coordinator.service.api.motion import RESTARTS, run_script
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.work import LINES_MAX
-from coordinator.streaming.move_source import ProgramOutput
 from coordinator.support.version import version
 from nodes.support.errors import CanductorError
 
@@ -32,8 +30,6 @@ Endpoint = Callable[[Client, Request], Result | Awaitable[Result]]
 APP: Final = "canductor"
 WHO: Final = "a client of the Klippy API"
 MESH_ARGUMENTS_MAX: Final = 32
-ALWAYS: Final = frozenset(("M105", "M115", "STATUS", "HELP"))
-"""Commands that also a machine that stopped answers."""
 _EMERGENCY: Final = re.compile(r"^\s*(?:N\d+\s*)?M112\b", re.IGNORECASE | re.MULTILINE)
 _ROOT: Final = Path(__file__).parent.parent.parent
 
@@ -50,6 +46,7 @@ class Endpoints:
         config: Path,
         say: Callable[[str], None],
         registered: Callable[[], None],
+        log_file: Path | None = None,
     ) -> None:
         self.status = StatusBuilder(service)
         self._service = service
@@ -62,7 +59,7 @@ class Endpoints:
             "process_id": os.getpid(),
             "user_id": os.getuid(),
             "group_id": os.getgid(),
-            "log_file": "",
+            "log_file": "" if log_file is None else str(log_file.absolute()),
             "config_file": str(config.absolute()),
             "software_version": f"{APP}-{version()}",
             "cpu_info": f"{os.cpu_count() or 1} core {platform.machine()}",
@@ -173,41 +170,11 @@ class Endpoints:
         lines = [line for line in script.splitlines() if line.strip()]
         try:
             for first in range(0, len(lines), LINES_MAX):
-                await self._piece(lines[first : first + LINES_MAX])
+                await run_lines(self._service, lines[first : first + LINES_MAX], self._say)
         except CanductorError as error:
             self._say(line_of(ReplyKind.ERROR, str(error)))
             raise
         return {}
-
-    async def _piece(self, lines: Sequence[str]) -> None:
-        service = self._service
-        state, message = state_of(service)
-        if state != "ready":
-            names = {line.split(maxsplit=1)[0].upper() for line in lines}
-            if names <= ALWAYS and service.machine is not None:
-                self._answer(lines)
-                return
-            if state == "startup" or not names <= RESTARTS.keys():
-                raise RequestError(message)
-            lines = lines[:1]
-        outcome = await run_script(service, "\n".join(lines), wait=False)
-        if not outcome.logged:
-            for output in outcome.output:
-                self._say(line_of(kind_of(output), output.text))
-
-    def _answer(self, lines: Sequence[str]) -> None:
-        """Answer what a machine that stopped still knows."""
-        machine = self._service.up_machine()
-        known = machine.modules.vocabulary.commands
-        for line in lines:
-            command = parse(line.encode(errors="replace"))
-            reader = None if command is None else known.get(command.name)
-            if command is None or reader is None:
-                raise WordError(f"this machine does not know {line.strip()[:40]}")
-            reading = reader.read(Call(command, 0, (0.0,) * 4, ""))
-            if isinstance(reading, Immediate):
-                for text in reading.replies:
-                    self._say(line_of(reading.kind, text))
 
     # --------------------------------------------------------------------------------------- the others
 
@@ -234,10 +201,3 @@ class Endpoints:
     def _emergency_stop(self, _client: Client, _request: Request) -> Result:
         self._service.emergency_stop(WHO)
         return {}
-
-
-def kind_of(output: ProgramOutput) -> ReplyKind:
-    """Return how TOLD reads: notices are information."""
-    kind = getattr(output, "kind", ReplyKind.INFORMATION)
-    assert isinstance(kind, ReplyKind)
-    return kind

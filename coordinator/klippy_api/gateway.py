@@ -147,10 +147,11 @@ class Gateway:
         *,
         on_notice: Callable[[str], None],
         stop_lane: StopLane | None = None,
+        log_file: Path | None = None,
     ) -> None:
         self.notice = on_notice
         self._stop_lane = stop_lane
-        self.endpoints = Endpoints(service, config, self.say, self.registered)
+        self.endpoints = Endpoints(service, config, self.say, self.registered, log_file)
         service.programs.on_remote = self._call_remote
         self._service = service
         self._connections: dict[Connection, None] = {}

@@ -10,7 +10,7 @@ import pytest
 
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.service.jobs.fed import LINES_AHEAD_MAX
-from coordinator.service.jobs.journal import NAME, Journal
+from coordinator.service.jobs.journal import NAME, Journal, journal_path
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from tests.stages.served import Served, running
@@ -231,13 +231,16 @@ def test_what_is_refused(tmp_path: Path) -> None:
 
 def test_after_a_crash_it_is_told_and_cannot_be_recovered(tmp_path: Path) -> None:
     (tmp_path / "jobs").mkdir()
-    journal = Journal(tmp_path / "jobs" / NAME, lambda _: None)
+    old = tmp_path / "jobs" / NAME  # where earlier versions kept it
+    journal = Journal(old, lambda _: None)
     journal.begin("JOB", 0, 0, fed=True)
     journal.note(17, {})
     journal.close()
 
     async def body(stage: Served) -> None:
         assert stage.tree.get("job.interrupted_line") == 17
+        assert not old.exists(), "front ends list that folder"
+        assert journal_path(tmp_path / "state", tmp_path / "jobs").exists()
         assert any(
             "JOB was interrupted at line 17; its lines came from a client" in line for line in stage.lines
         )

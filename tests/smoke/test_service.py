@@ -12,11 +12,9 @@ from typing import Any
 
 from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.discovery.browser import Browser
-from coordinator.service.jobs.journal import NAME
 from tests.stages.processes import (
     LONG,
     MCU_UUID,
-    ROOT,
     SLOW,
     TOOLHEAD_UUID,
     Command,
@@ -120,7 +118,8 @@ def test_a_demo_is_served_announced_and_seen_to_go(tmp_path: Path) -> None:
     name, path = f"demo_{os.getpid()}", tmp_path / "demo.sock"
     tokens = tmp_path / "tokens"
     tokens.touch(0o600)
-    words = ("demo", "--serve", "--name", name, "--announce")
+    link, log = tmp_path / "printer", tmp_path / "canductor.log"
+    words = ("demo", "--serve", "--name", name, "--announce", "--pty", link, "--log-file", log)
     tcp = ("--tcp", f"127.0.0.1:{own_port(1)}", "--tokens", tokens, "--no-tls-on-loopback")
 
     async def announced(state: str | None) -> None:
@@ -132,9 +131,22 @@ def test_a_demo_is_served_announced_and_seen_to_go(tmp_path: Path) -> None:
     with served(*words, *tcp, path=path) as (command, client):
         assert client.call("job.list")["files"][0]["name"] == "part.gcode"
         asyncio.run(announced("ready"))
+        port = os.open(link, os.O_RDWR | os.O_NOCTTY)
+        os.write(port, b"N0 M110 N0*125\nN1 M115*39\n")
+        assert "\nok FIRMWARE_NAME:canductor " in until_ok(port)
+        os.close(port)
         client.call("machine.emergency_stop", {"who": "a test"})
         asyncio.run(announced("shutdown"))
         command.signal(signal.SIGINT)
         command.end()
     asyncio.run(announced(None))
-    assert not list((ROOT / "config").rglob(NAME)), "its journal is where it ran, not with the examples"
+    assert not link.is_symlink()
+    assert "shutdown: emergency stop by 'a test'" in log.read_text(encoding="utf-8")
+
+
+def until_ok(port: int) -> str:
+    """Return what a serial host gets from PORT, up to the answer of its second line."""
+    data = b""
+    while data.count(b"ok") < 2 or not data.endswith(b"\n"):
+        data += os.read(port, 1000)
+    return data.decode().rstrip()

@@ -57,6 +57,7 @@ class Served:
             jobs=self.jobs,
             node_commands=node_commands,
             tables=tables,
+            state=folder / "state",
             own_process=own_process,
         )
         self.listeners: list[Callable[[Entry], None]] = []

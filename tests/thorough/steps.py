@@ -72,6 +72,12 @@ def steps(amount: Amount) -> Iterator[Step]:
     yield Step("fuzz-mt", "the table receiver under the sanitizers", (*fuzz, "mt"), _FUZZ_FIGURE)
     yield Step("fuzz-live", "the sockets of a machine that prints", (*fuzz, "live"), r"^lead lost.*$")
     yield Step(
+        "octoprint",
+        "OctoPrint prints over a pseudo-terminal",
+        ("make", "octoprint"),
+        r"(?<=^ok: )printed .*$",
+    )
+    yield Step(
         "soak",
         "a service that prints while clients come and go",
         (python, "-m", "tests.soak.run", "--minutes", str(amount.soak_minutes)),

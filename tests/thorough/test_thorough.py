@@ -15,7 +15,18 @@ def step(name: str, code: str) -> Step:
 
 def test_the_steps_are_those_of_the_manual() -> None:
     names = [entry.name for entry in steps(Amount())]
-    assert names == ["full", "sim", "mutants", "mutation", "arm", "fuzz", "fuzz-mt", "fuzz-live", "soak"]
+    assert names == [
+        "full",
+        "sim",
+        "mutants",
+        "mutation",
+        "arm",
+        "fuzz",
+        "fuzz-mt",
+        "fuzz-live",
+        "octoprint",
+        "soak",
+    ]
 
 
 def test_a_table_shows_each_step_with_its_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

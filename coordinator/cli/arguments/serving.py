@@ -26,6 +26,13 @@ def declare_serving(command: argparse.ArgumentParser) -> None:
         help="serve programs at this Unix socket; see docs/run.md",
     )
     add("--klippy-api", type=Path, metavar="PATH", help="serve Moonraker at this Unix socket")
+    add(
+        "--pty",
+        type=Path,
+        metavar="PATH",
+        help="serve a serial host such as OctoPrint: PATH links to its port",
+    )
+    add("--log-file", type=Path, metavar="FILE", help="write the log to this file, in turns of 10 MiB")
     add("--name", help="name of the machine (default: that of the configuration file)")
     add("--jobs", type=_folder, metavar="DIR", help="folder of the files that front ends may print")
     add("--node-commands", action="store_true", help="let administrators send raw commands to nodes")
@@ -91,7 +98,8 @@ def declare_serving(command: argparse.ArgumentParser) -> None:
 def is_asked_to_serve(given: argparse.Namespace) -> bool:
     """Return whether the options ask for a service that stays."""
     return any(
-        address is not None for address in (given.path, given.klippy_api, given.tcp, given.web, given.metrics)
+        address is not None
+        for address in (given.path, given.klippy_api, given.pty, given.tcp, given.web, given.metrics)
     )
 
 

@@ -73,6 +73,8 @@ class ServiceSettings:
     """Of this run of the service: shows whether two addresses lead to the same one."""
     tables: Path | None = None
     """Where accepted axis tables are kept; None: only as long as the service lives."""
+    state: Path | None = None
+    """Folder of what outlives the service: the journal of jobs; None: no journal is kept."""
     own_process: bool = False
     """Whether the process runs nothing else: the service controls its garbage collector and allocator."""
 
@@ -125,7 +127,7 @@ class MachineService:
         self._cache = cache
         self._record = record
         self._figures = Figures(state)
-        self.recovery = Recovery(self)
+        self.recovery = Recovery(self, settings.state)
         self.programs = Programs(self, self.recovery)
         self.fed = FedJobs(self)
         self._restart = asyncio.Event()

@@ -1,12 +1,13 @@
 """The journal of a job: up to which line it was carried out, so that this outlives whatever ends the service.
 
-One small file in the job folder. Each entry is a line of JSON, appended by a thread of its own and brought to
-the disk every SYNC_S; a power cut costs the last entries and nothing else. A file beyond FILE_BYTES_MAX is
-written again with what still counts: its head and its newest entry. So is one whose last entry could not be
-written: half an entry must not spoil the next one.
+One small file for each job folder, outside it: front ends list what is in there. Each entry is a line of
+JSON, appended by a thread of its own and brought to the disk every SYNC_S; a power cut costs the last entries
+and nothing else. A file beyond FILE_BYTES_MAX is written again with what still counts: its head and its
+newest entry. So is one whose last entry could not be written: half an entry must not spoil the next one.
 """
 
 import contextlib
+import hashlib
 import json
 import math
 import os
@@ -21,6 +22,7 @@ from typing import Any, Final
 from coordinator.support.atomic_file import atomic_write, sync_folder
 
 NAME: Final = ".canductor-journal"
+"""Of the one that earlier versions kept in the job folder."""
 ENTRY_S: Final = 1.0
 """Entries are that far apart."""
 SYNC_S: Final = 2.0
@@ -45,6 +47,12 @@ class Interrupted:
     """What held there that the file does not say: offset, factors, heaters, fan."""
     fed: bool = False
     """Whether its lines came from a client: there is no file to go on with."""
+
+
+def journal_path(state: Path, jobs: Path) -> Path:
+    """Return where the journal of the job folder JOBS is, in the folder STATE."""
+    digest = hashlib.sha256(os.fsencode(jobs.absolute())).hexdigest()[:12]
+    return state / f"journal-{digest}"
 
 
 def read_journal(path: Path) -> Interrupted | None:

@@ -6,8 +6,10 @@ and what was hot can be made hot again. The line that was being carried out is c
 
 import asyncio
 import contextlib
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from coordinator.gcode.builtins.state import come_back
@@ -27,7 +29,7 @@ from coordinator.service.core.motion import Motion
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Setting, Work
 from coordinator.service.jobs.forward import Reached, read_forward
 from coordinator.service.jobs.jobs import JobPhase, JobRun
-from coordinator.service.jobs.journal import ENTRY_S, NAME, Interrupted, Journal, read_journal
+from coordinator.service.jobs.journal import ENTRY_S, NAME, Interrupted, Journal, journal_path, read_journal
 from coordinator.service.jobs.resume_homing import (
     LIFT_MM,
     LIFT_MM_S,
@@ -89,11 +91,12 @@ class RecoverWork(FileWork):
 
 
 class Recovery:
-    """Keeps the journal of SERVICE's jobs, and has an interrupted one go on; on the control loop."""
+    """Keeps the journal of SERVICE's jobs in the folder STATE, has an interrupted one go on; on the loop."""
 
-    def __init__(self, service: ServiceInterface) -> None:
+    def __init__(self, service: ServiceInterface, state: Path | None) -> None:
         self.interrupted: Interrupted | None = None
         self._service = service
+        self._state = state
         self._journal: Journal | None = None
         self._job: JobRun | None = None
         self._noted_s = 0.0
@@ -104,9 +107,10 @@ class Recovery:
     def open(self) -> None:
         """Look for an interrupted job, once there is a job folder."""
         folder = self._service.folder
-        if folder is None or self._journal is not None:
+        if folder is None or self._state is None or self._journal is not None:
             return
-        path = folder.path / NAME
+        path = journal_path(self._state, folder.path)
+        _take_over(folder.path / NAME, path)
         self._show(read_journal(path))
         loop = asyncio.get_running_loop()
 
@@ -326,6 +330,14 @@ def _mesh(modules: Modules, motion: Motion) -> Mapping[str, Any]:
         return {}
     x, y, z, _ = (motion.trace.at(motion.now_s) or motion.planned).position
     return {"mesh": held, "bed_mm": mesh.added_mm((x, y, z))}
+
+
+def _take_over(old: Path, path: Path) -> None:
+    """Move the journal that an earlier version has left in the job folder, and make the folder of PATH."""
+    with contextlib.suppress(OSError):  # the journal says when it cannot be written
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if old.is_file() and not old.is_symlink() and not path.exists():
+            shutil.move(old, path)
 
 
 def _hot(modules: "Modules") -> Mapping[str, Any]:

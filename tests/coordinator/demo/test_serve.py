@@ -12,7 +12,7 @@ from tests.stages.printer_text import DEMO_CFG, write
 def test_without_a_folder_the_demos_own_part_is_copied_to_one(tmp_path: Path) -> None:
     found = with_jobs(ServeOptions(name="demo"), load_machine(str(DEMO_MACHINE)), tmp_path)
     assert found.jobs is not None
-    assert found.jobs.is_relative_to(tmp_path), "a service writes its journal there"
+    assert found.jobs.is_relative_to(tmp_path)
     (part,) = found.jobs.iterdir()
     assert part.read_bytes() == DEMO_GCODE.read_bytes()
 

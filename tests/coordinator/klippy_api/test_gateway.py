@@ -236,6 +236,8 @@ async def _check_print(client: KlippyClient, served: Served, printer: Printer) -
     assert await client.ask("pause_resume/cancel") == {}
     await look("cancelled")
     assert states == ["printing", "paused", "printing", "paused", "cancelled"], "a cancel is no resume"
+    assert [path.name for path in served.jobs.iterdir()] == ["sub"], "front ends list what is in there"
+    assert len(list((served.jobs.parent / "state").glob("journal-*"))) == 1
 
 
 async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: Served) -> None:
