@@ -158,6 +158,8 @@ def host(command: list[str], api: Path, folder: Path) -> Iterator[tuple[int, Kli
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
     try:
         yield process.pid, connect(process, api, folder)
+    except ProcessLookupError:
+        sys.exit(f"the host ended:\n{(folder / 'host.log').read_text()}")
     finally:
         process.send_signal(signal.SIGTERM)
         try:

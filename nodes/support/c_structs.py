@@ -1,6 +1,7 @@
 """Conversion of C structs to dataclasses, by the fields of the cffi declaration."""
 
 from dataclasses import fields
+from functools import cache
 from typing import Any, TypeVar
 
 from _cffi_backend import typeof  # not cffi.FFI: that imports a parser of C
@@ -20,5 +21,13 @@ def from_struct(kind: type[T], struct: Any, **others: Any) -> T:
 
     Raises TypeError when a field without a default is in neither.
     """
-    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]  # any dataclass
-    return kind(**{name: getattr(struct, name) for name in field_names(struct) if name in names} | others)
+    names = _common_names(kind, typeof(struct))
+    return kind(**{name: getattr(struct, name) for name in names} | others)
+
+
+@cache
+def _common_names(kind: Any, struct: Any) -> tuple[str, ...]:
+    """Return the fields that a dataclass and a C type have both; there are about a dozen such pairs."""
+    names = {field.name for field in fields(kind)}
+    found = struct.item if struct.kind == "pointer" else struct
+    return tuple(name for name, _ in found.fields or () if name in names)
