@@ -39,6 +39,8 @@ THREE_NODES = ROOT / "config" / "demo" / "machine.cfg"
 PROGRAM = ROOT / "config" / "demo" / "part.gcode"
 SETTLE_S = 6.0
 """Left out at the start of each state; the nodes' clocks have settled by then."""
+FILAMENT_MM = 5.0
+"""Once the print has taken so much it is not homing any more."""
 SCRIPTS = 40
 START_S = 60.0
 STATES = ("waiting", "heating", "script", "printing")
@@ -218,6 +220,14 @@ def measure_script(client: KlippyClient) -> None:
     )
 
 
+def print_stats(client: KlippyClient) -> dict[str, Any]:
+    """Return how the print does; ends the benchmark when it does not print."""
+    stats = client.call("objects/query", objects={"print_stats": None})["status"]["print_stats"]
+    if stats["state"] != "printing":
+        sys.exit(f"it does not print: {stats}")
+    return dict(stats)
+
+
 def run_states(command: list[str], api: Path, folder: Path, chosen: argparse.Namespace) -> None:
     """Measure a host in all chosen states."""
     with host(command, api, folder) as (pid, client):
@@ -238,10 +248,10 @@ def run_states(command: list[str], api: Path, folder: Path, chosen: argparse.Nam
         if "printing" in chosen.only:
             client.script("M140 S60\nM104 S200")
             client.script("SDCARD_PRINT_FILE FILENAME=part.gcode")
+            while print_stats(client)["filament_used"] < FILAMENT_MM:
+                time.sleep(0.5)
             state("printing")
-            status = client.call("objects/query", objects={"print_stats": None, "toolhead": None})["status"]
-            if status["print_stats"]["state"] != "printing":
-                sys.exit(f"it does not print: {status['print_stats']}")
+            print_stats(client)
         client.close()
 
 

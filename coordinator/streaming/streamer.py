@@ -179,6 +179,8 @@ class Streamer:
         ahead_s = self.worker.steps.generated_until - self.print_time_now()
         if isinstance(cycle.event, Full) and ahead_s > SEND_AHEAD_S - CYCLE_S:
             return FULL_CYCLE_S
+        if isinstance(cycle.event, StandstillAction) and self._standstill is not None:
+            return REST_CYCLE_S
         stands_s = cycle.planned.stands_from_s
         if not isinstance(cycle.event, Idle) or stands_s is None or self._due.waiting:
             return CYCLE_S
@@ -208,6 +210,7 @@ class Streamer:
             if self.print_time_now() < event.print_time_s + self.worker.steps.lag_s + SETTLE_S:
                 return
             self._standstill = StandstillTask(event)
+            self._standstill.when_over(self.call)
         if self._standstill.look():
             self._standstill = None
             if event.moved:
