@@ -72,6 +72,8 @@ class Streamer:
         """So far."""
         self._witness = witness
         self._nodes = machine.moving
+        if compensation is not None:
+            compensation.on_want = self.call
         self._due = DueEvents()
         self.began_s = 0.0
         """Print time at which the job began, or went on after something else had moved the machine."""
