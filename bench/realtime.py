@@ -223,7 +223,7 @@ def measure_script(client: KlippyClient) -> None:
 def print_stats(client: KlippyClient) -> dict[str, Any]:
     """Return how the print does; ends the benchmark when it does not print."""
     stats = client.call("objects/query", objects={"print_stats": None})["status"]["print_stats"]
-    if stats["state"] != "printing":
+    if stats["state"] not in ("printing", "standby"):  # it has begun, or is about to
         sys.exit(f"it does not print: {stats}")
     return dict(stats)
 
@@ -251,7 +251,8 @@ def run_states(command: list[str], api: Path, folder: Path, chosen: argparse.Nam
             while print_stats(client)["filament_used"] < FILAMENT_MM:
                 time.sleep(0.5)
             state("printing")
-            print_stats(client)
+            if print_stats(client)["state"] != "printing":
+                sys.exit("the print ended before it was measured; take fewer --seconds")
         client.close()
 
 
@@ -283,7 +284,9 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="+", choices=(1, 3), default=[1, 3])
     parser.add_argument("--threads", action="store_true", help="print each thread, too")
     parser.add_argument("--peer", type=Path, help="klippy.py of the peer")
-    parser.add_argument("--peer-python", default=sys.executable, help="the Python that has what the peer needs")
+    parser.add_argument(
+        "--peer-python", default=sys.executable, help="the Python that has what the peer needs"
+    )
     chosen = parser.parse_args()
     os.chdir(ROOT)
     if 1 in chosen.nodes:

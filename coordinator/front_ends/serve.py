@@ -227,9 +227,7 @@ class _ServiceProcess:
         from coordinator.front_ends.http_servers import make_metrics  # noqa: PLC0415 (see there)
 
         about = {"name": self._options.name, "version": version(), "api": str(API_VERSION)}
-        metrics = make_metrics(
-            fields, about, self._options.metrics, is_open=self._options.metrics_open
-        )
+        metrics = make_metrics(fields, about, self._options.metrics, is_open=self._options.metrics_open)
         await metrics.start()
         stack.push_async_callback(metrics.close)
         _print(f"metrics are at http://{bracketed(self._options.metrics[0])}:{metrics.port}/metrics")

@@ -22,9 +22,9 @@ from coordinator.streaming.worker import SEND_AHEAD_S, START_LEAD_S, Cycle, Moti
 from nodes.support.errors import CanductorError
 
 CYCLE_S: Final = 0.05
-FULL_CYCLE_S: Final = 0.2
+FULL_CYCLE_S: Final = 0.25
 """While planner and commands reach as far ahead as they may; taken off the lead of SEND_AHEAD_S."""
-REST_CYCLE_S: Final = 0.5
+REST_CYCLE_S: Final = 1.0
 """At rest, where a cycle only steers the clocks of secondary nodes, predicted over a second."""
 BUSY_START_LEAD_S: Final = 0.6
 """START_LEAD_S on a bus with other traffic, where the first commands, dense as in every ramp, take longer."""
@@ -39,8 +39,8 @@ class Streamer:
     """Runs one JOB on MACHINE, whose nodes are READY.
 
     ON_OUTPUT gets replies and notices, ON_STATE the state of the planner in every cycle; ON_CYCLE ends each
-    cycle. WITNESS sees moves and commands pass, COMPENSATION has the tables of the axes. AT_REST returns whether
-    nobody waits for a cycle, unless ``call`` is called.
+    cycle. WITNESS sees moves and commands pass, COMPENSATION has the tables of the axes. AT_REST returns
+    whether nobody waits for a cycle, unless ``call`` is called.
     """
 
     def __init__(
