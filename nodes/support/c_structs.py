@@ -21,7 +21,7 @@ def from_struct(kind: type[T], struct: Any, **others: Any) -> T:
 
     Raises TypeError when a field without a default is in neither.
     """
-    names = _common_names(kind, typeof(struct))
+    names = _common_names(kind, typeof(struct))  # type: ignore[arg-type]  # classes are hashable
     return kind(**{name: getattr(struct, name) for name in names} | others)
 
 

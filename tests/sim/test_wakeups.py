@@ -1,4 +1,4 @@
-"""How often the coordinator wakes up, counted in virtual time: at rest, for a client's line, while printing."""
+"""How often the coordinator wakes up, in virtual time: at rest, for a line of a client, while printing."""
 
 import asyncio
 from pathlib import Path
