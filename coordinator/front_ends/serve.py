@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from ipaddress import ip_address
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
@@ -23,7 +24,6 @@ from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.tcp_listener import raise_files_limit
 from coordinator.ipc.server.uploads import upload_method
 from coordinator.klippy_api.gateway import Gateway
-from coordinator.metrics.server import MetricsServer, MetricsSettings
 from coordinator.runtime.linux_host import LinuxHost
 from coordinator.serial_host.terminal import PseudoTerminal
 from coordinator.service.api.methods import add_methods
@@ -37,13 +37,14 @@ from coordinator.support.values import Value
 from coordinator.support.version import version
 from coordinator.tables.store import table_folder
 from coordinator.web.access import LINK_S
-from coordinator.web.methods import add_page_methods
-from coordinator.web.server import WebServer
 from coordinator.web.settings import WebSettings
 from nodes.dictionary.cache import DictionaryCache
 from nodes.support.host_sockets import socket_folder
 from nodes.support.state_folder import state_folder
 from nodes.support.terminal import show
+
+if TYPE_CHECKING:
+    from coordinator.web.server import WebServer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,7 +190,7 @@ class _ServiceProcess:
                 self.state = str(service.state)
                 self.cut_off = service.cut_off
 
-    def _report_addresses(self, page: WebServer | None) -> None:
+    def _report_addresses(self, page: "WebServer | None") -> None:
         _print(f"serving at {self.path}")
         if self._options.tcp is not None:
             _print(f"serving at {_address(self._options, self._server.tcp_port)}")
@@ -231,7 +232,7 @@ class _ServiceProcess:
         stop_lane.look_also(self._terminal.find_stop)
         _print(f"serving a serial host at {path}")
 
-    def _page(self, registry: Registry, service: MachineService) -> WebServer | None:
+    def _page(self, registry: Registry, service: MachineService) -> "WebServer | None":
         """Return the live page if it is asked for, with its methods in REGISTRY."""
         options = self._options
         if options.web is None:
@@ -241,9 +242,9 @@ class _ServiceProcess:
         settings = WebSettings(host=host, port=port, names=options.web_names, sessions=sessions)
         if not settings.on_loopback and not options.web_without_tls:
             settings = replace(settings, certificate=options.certificate, private_key=options.private_key)
-        page = WebServer(self._server, settings, on_notice=lambda text: service.log.add("notice", text))
-        add_page_methods(registry, page)
-        return page
+        from coordinator.front_ends.http_servers import make_page  # noqa: PLC0415 (see there)
+
+        return make_page(self._server, registry, settings, lambda text: service.log.add("notice", text))
 
     async def _open_metrics(self, tree: StateTree, stack: contextlib.AsyncExitStack) -> None:
         """Open the endpoint for Prometheus if asked for; raises CanductorError."""
@@ -254,12 +255,13 @@ class _ServiceProcess:
             figures = {f"api.{name}": value for name, value in self._server.figures().items()}
             return tree.snapshot().values | figures
 
-        host, port = self._options.metrics
+        from coordinator.front_ends.http_servers import make_metrics  # noqa: PLC0415 (see there)
+
         about = {"name": self._options.name, "version": version(), "api": str(API_VERSION)}
-        metrics = MetricsServer(fields, about, MetricsSettings(host, port, open=self._options.metrics_open))
+        metrics = make_metrics(fields, about, self._options.metrics, is_open=self._options.metrics_open)
         await metrics.start()
         stack.push_async_callback(metrics.close)
-        _print(f"metrics are at http://{bracketed(host)}:{metrics.port}/metrics")
+        _print(f"metrics are at http://{bracketed(self._options.metrics[0])}:{metrics.port}/metrics")
 
     def _announce(self, service: MachineService, stack: contextlib.AsyncExitStack) -> None:
         """Announce the machine on the network, if wanted."""

@@ -156,6 +156,8 @@ class Gateway:
         self._service = service
         self._connections: dict[Connection, None] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._subscribed = asyncio.Event()
+        """Whether any client may wait for updates."""
         self._updates: asyncio.Task[None] | None = None
         self._lines: list[str] = []
         self._starts = service.starts
@@ -255,6 +257,8 @@ class Gateway:
         except Exception as error:  # noqa: BLE001 (a bug of one endpoint must not end the machine)
             self._fail(connection, request, self._sentence(request, error))
             return
+        if client.subscription is not None:
+            self._subscribed.set()
         if isinstance(result, Awaitable):
             client.running += 1
             task = asyncio.get_running_loop().create_task(self._finish(connection, request, result))
@@ -295,6 +299,7 @@ class Gateway:
 
     async def _update(self) -> None:
         while True:
+            await self._subscribed.wait()
             await asyncio.sleep(UPDATE_S)
             try:
                 self._send_changes()
@@ -308,6 +313,8 @@ class Gateway:
     def _send_changes(self) -> None:
         watching = [c for c in self._connections if c.client.subscription is not None and c.writable]
         if not watching:
+            if all(connection.client.subscription is None for connection in self._connections):
+                self._subscribed.clear()
             return
         status, now_s = self.endpoints.status.build(), self._service.now_s
         for connection in watching:

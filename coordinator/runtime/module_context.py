@@ -57,7 +57,11 @@ class ModuleContext:
             self._loop.call_soon_threadsafe(call)
 
     def every(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
-        """Call CALL every so many seconds; returns what ends it. All end when the machine closes."""
+        """Call CALL every so many seconds; returns what ends it. All end when the machine closes.
+
+        Calls of one period come together, so that they wake the computer once: the first comes after half to
+        one and a half periods.
+        """
         timer = _Timer(seconds, call, again=True, ended=self._timers.discard)
         self._timers.add(timer)
         return timer.end
@@ -96,6 +100,8 @@ class _Timer:
         self._ended = ended
         self._loop = asyncio.get_running_loop()
         self._due_s = self._loop.time() + seconds
+        if again:
+            self._due_s = round(self._due_s / seconds) * seconds
         self._handle = self._loop.call_at(self._due_s, self._fire)
 
     def _fire(self) -> None:

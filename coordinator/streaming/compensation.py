@@ -4,8 +4,8 @@ The control loop says which tables are wanted; the motion worker takes them up w
 taken up makes no step by itself: see docs/tables.md for how it takes effect.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 from coordinator.config.model import MachineDescription
@@ -52,11 +52,17 @@ class Compensation:
         at_once = limits.square_corner_velocity
         self._take_up_mm_s = (at_once, at_once, min(at_once, Z_SHARE * limits.max_z_velocity))
         self.states: Mapping[str, AxisState] = {}
+        self.on_want: Callable[[], None] = lambda: None
+        """Called by ``want``."""
 
     def want(self, axis: str, table: AxisTable | None) -> None:
         """Take TABLE up on AXIS (a letter), or remove its table, as soon as that is possible."""
         others = {name: kept for name, kept in self.wanted.items() if name != axis}
         self.wanted = others if table is None else {**others, axis: table}
+        if (state := self.states.get(axis)) is not None:  # before the next cycle says so
+            applied = self._taken.get(axis) is self.wanted.get(axis)
+            self.states = {**self.states, axis: replace(state, applied=applied)}
+        self.on_want()
 
     def is_due(self, homed: str) -> bool:
         """Return whether ``take_up`` has something to do, with the axes HOMED (capital letters)."""

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 
 from coordinator.gcode.events import Done, StandstillAction
 from coordinator.runtime.machine import MachineStopped
@@ -15,6 +16,10 @@ class StandstillTask:
         self._event = event
         self._has_begun = self._is_ending = False
         self._task = asyncio.ensure_future(self._perform())
+
+    def when_over(self, call: Callable[[], None]) -> None:
+        """Call CALL once ``look`` has a result."""
+        self._task.add_done_callback(lambda _: call())
 
     def look(self) -> bool:
         """Cancel it if its event was cancelled; return whether it is over; the event has the result.

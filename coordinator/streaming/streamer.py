@@ -1,7 +1,9 @@
 """Real time: feeds a job's motion to the nodes, early enough and not too early.
 
-The control loop wakes every CYCLE_S. What costs time (the job's g-code, planning, step generation) runs in
-one worker thread (``motion_worker.py``); the loop only hands finished batches to the links.
+What costs time (the job's g-code, planning, step generation) runs in one worker thread
+(``motion_worker.py``), cycle by cycle; the loop only hands finished batches to the links. The next cycle
+comes when there may be something to do: after CYCLE_S, after FULL_CYCLE_S while everything is made as far
+ahead as it may be, after REST_CYCLE_S while the machine has nothing to do; or at once, by ``call``.
 """
 
 import asyncio
@@ -9,17 +11,21 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
-from coordinator.gcode.events import Emergency, End, Event, Notice, StandstillAction
+from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Notice, StandstillAction
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
 from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import MoveSource, Planned, ProgramOutput, Witness
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.standstill import StandstillTask
 from coordinator.streaming.timed_events import Due, DueEvents
-from coordinator.streaming.worker import START_LEAD_S, Cycle, MotionWorker
+from coordinator.streaming.worker import SEND_AHEAD_S, START_LEAD_S, Cycle, MotionWorker
 from nodes.support.errors import CanductorError
 
 CYCLE_S: Final = 0.05
+FULL_CYCLE_S: Final = 0.25
+"""While planner and commands reach as far ahead as they may; taken off the lead of SEND_AHEAD_S."""
+REST_CYCLE_S: Final = 1.0
+"""At rest, where a cycle only steers the clocks of secondary nodes, predicted over a second."""
 BUSY_START_LEAD_S: Final = 0.6
 """START_LEAD_S on a bus with other traffic, where the first commands, dense as in every ramp, take longer."""
 BUSY_LOAD: Final = 0.3
@@ -33,7 +39,8 @@ class Streamer:
     """Runs one JOB on MACHINE, whose nodes are READY.
 
     ON_OUTPUT gets replies and notices, ON_STATE the state of the planner in every cycle; ON_CYCLE ends each
-    cycle. WITNESS sees moves and commands pass, COMPENSATION has the tables of the axes.
+    cycle. WITNESS sees moves and commands pass, COMPENSATION has the tables of the axes. AT_REST returns
+    whether nobody waits for a cycle, unless ``call`` is called.
     """
 
     def __init__(
@@ -47,6 +54,7 @@ class Streamer:
         on_output: Callable[[ProgramOutput], None],
         on_state: Callable[[Planned], None],
         on_cycle: Callable[[], None] = lambda: None,
+        at_rest: Callable[[], bool] = lambda: False,
     ) -> None:
         self._machine = machine
         self.worker = MotionWorker(machine, job, record=record, witness=witness, compensation=compensation)
@@ -55,8 +63,17 @@ class Streamer:
         self._on_output = on_output
         self._on_state = on_state
         self._on_cycle = on_cycle
+        self._at_rest = at_rest
+        self._called = False
+        """Since the cycle at hand began."""
+        self._pause: asyncio.Future[None] | None = None
+        """Between two cycles."""
+        self.cycles = 0
+        """So far."""
         self._witness = witness
         self._nodes = machine.moving
+        if compensation is not None:
+            compensation.on_want = self.call
         self._due = DueEvents()
         self.began_s = 0.0
         """Print time at which the job began, or went on after something else had moved the machine."""
@@ -79,10 +96,17 @@ class Streamer:
         CAUSE is a sentence. The end of a job that has been read to its end is not held up.
         """
         self.worker.held = cause
+        self.call()
 
     def release(self) -> None:
         """Resume the g-code after ``hold``."""
         self.worker.held = None
+        self.call()
+
+    def call(self) -> None:
+        """Begin the next cycle at once, from the control loop: there is something new to do."""
+        self._called = True
+        self._end_pause()
 
     @property
     def held(self) -> str | None:
@@ -132,6 +156,8 @@ class Streamer:
         with ThreadPoolExecutor(1, thread_name_prefix="motion") as thread:
             event: Event | None = None
             while not isinstance(event, End):
+                self._called = False
+                self.cycles += 1
                 cycle = await loop.run_in_executor(thread, self.worker.work, event)
                 event = cycle.event
                 if isinstance(event, Emergency):
@@ -144,9 +170,41 @@ class Streamer:
                 if isinstance(event, StandstillAction):
                     await self._attend(event)
                 if event is not None or self.held is not None:
-                    await asyncio.sleep(CYCLE_S)
+                    await self._pause_for(self._cycle_s(cycle))
             self.ended_s = self._job.planner.print_time_end_s
             await self._settle(thread)
+
+    def _cycle_s(self, cycle: Cycle) -> float:
+        """Return after which time the next cycle has something to do, unless somebody calls."""
+        if self.held is not None:
+            return CYCLE_S
+        ahead_s = self.worker.steps.generated_until - self.print_time_now()
+        if isinstance(cycle.event, Full) and ahead_s > SEND_AHEAD_S - CYCLE_S:
+            return FULL_CYCLE_S
+        if isinstance(cycle.event, StandstillAction) and self._standstill is not None:
+            return REST_CYCLE_S
+        stands_s = cycle.planned.stands_from_s
+        if not isinstance(cycle.event, Idle) or stands_s is None or self._due.waiting:
+            return CYCLE_S
+        stands = self.print_time_now() >= stands_s + SETTLE_S
+        return REST_CYCLE_S if stands and self._at_rest() else CYCLE_S
+
+    async def _pause_for(self, pause_s: float) -> None:
+        """Wait PAUSE_S, or until ``call``."""
+        if self._called:
+            return
+        loop = asyncio.get_running_loop()
+        self._pause = loop.create_future()
+        timer = loop.call_later(pause_s, self._end_pause)
+        try:
+            await self._pause
+        finally:
+            timer.cancel()
+            self._pause = None
+
+    def _end_pause(self) -> None:
+        if self._pause is not None and not self._pause.done():
+            self._pause.set_result(None)
 
     async def _attend(self, event: StandstillAction) -> None:
         """Perform EVENT once all moves before it are executed."""
@@ -154,6 +212,7 @@ class Streamer:
             if self.print_time_now() < event.print_time_s + self.worker.steps.lag_s + SETTLE_S:
                 return
             self._standstill = StandstillTask(event)
+            self._standstill.when_over(self.call)
         if self._standstill.look():
             self._standstill = None
             if event.moved:

@@ -38,6 +38,11 @@ class DueEvents:
             ready.append(self._waiting.popleft())
         return ready
 
+    @property
+    def waiting(self) -> int:
+        """How many wait for their time."""
+        return len(self._waiting)
+
     def rest(self) -> list[Due]:
         """Return all that still waits: nothing comes after it."""
         return self.take(float("inf"), ())

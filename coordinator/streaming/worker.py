@@ -140,6 +140,8 @@ class MotionWorker:
         now = self.print_time_now()
         output: list[ProgramOutput] = []
         event = waiting_for
+        if 0 < self.steps.generated_until < now and self._planner.at_standstill:
+            self._generate(now)  # after a long rest: clocks are steered from now on, not from the last cycle
         if self.pipeline.compensation_due and self._all_generated():
             self.pipeline.compensate()
         held = self.held is not None

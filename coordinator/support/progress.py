@@ -8,13 +8,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self, TextIO
+from typing import TYPE_CHECKING, Self, TextIO
 
-from rich.console import Console
-from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
+if TYPE_CHECKING:
+    from coordinator.support.progress_live import LiveProgress
 
 from nodes.support.terminal import printable, show
 
@@ -106,13 +103,13 @@ class ProgressDisplay:
         # A plain line is for jobs that take long; a live picture shall stand at once.
         self._next_s = clock_s() + (0.0 if self._is_live else PLAIN_INTERVAL_S)
         self._last: Progress | None = None
-        self._live: Live | None = None
+        self._live: LiveProgress | None = None
 
     def __enter__(self) -> Self:
         if self._is_live:
-            # rich is slow to import: only who looks at it pays for it.
-            self._live = Live(console=Console(file=self._stdout), auto_refresh=False)
-            self._live.start()
+            from coordinator.support.progress_live import LiveProgress  # noqa: PLC0415 (rich: for who looks)
+
+            self._live = LiveProgress(self._title, self._stdout)
         return self
 
     def __exit__(
@@ -124,7 +121,7 @@ class ProgressDisplay:
         if self._live is not None:
             try:
                 if self._last is not None:
-                    self._live.update(self._picture(self._last), refresh=True)
+                    self._live.show(self._last)
             finally:
                 self._live.stop()
                 self._live = None
@@ -137,31 +134,6 @@ class ProgressDisplay:
             return
         self._next_s = now_s + self._interval_s
         if self._live is not None:
-            self._live.update(self._picture(progress), refresh=True)
+            self._live.show(progress)
         elif not self._is_live:
             show(f"{self._title}: {summary(progress)}", self._stderr)
-
-    def _picture(self, progress: Progress) -> "Table":
-        picture = Table.grid(padding=(0, 1))
-        picture.add_row(Text(f"{self._title}: {summary(progress)}"))
-        picture.add_row(ProgressBar(total=1.0, completed=progress.share, width=60))
-        if progress.nodes:
-            figures = Table(box=None, padding=(0, 2))
-            figures.add_column("node")
-            for heading in ("round trip ms", "repeated bytes", "queue", "lead ms", "clock µs"):
-                figures.add_column(heading, justify="right")
-            for node in progress.nodes:
-                figures.add_row(
-                    Text(printable(node.name)),
-                    _figure(node.round_trip_ms, 2),
-                    f"{node.retransmitted_bytes:,}",
-                    f"{node.queue_depth:,}",
-                    _figure(node.lead_ms, 0),
-                    _figure(node.clock_error_us, 1),
-                )
-            picture.add_row(figures)
-        return picture
-
-
-def _figure(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:,.{digits}f}"  # noqa: RUF001 (a dash for no value)

@@ -16,6 +16,8 @@ OnFrame = Callable[[Frame], None]
 class LinkInterface(Protocol):
     """The reliable connection to one node. Callbacks run on the control loop."""
 
+    on_sent: Callable[[], None]
+
     def send(  # noqa: D102
         self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False
     ) -> None: ...

@@ -37,6 +37,8 @@ class Link:
         self._on_responses = on_responses
         self._on_lost = on_lost
         self._name = bus.name if settings.nodeid is None else f"{bus.name} node {settings.nodeid}"
+        self.on_sent: Callable[[], None] = _ignore
+        """Called on the control loop when a command was queued, urgent ones left out."""
         self._failed: str | None = None
         self._drained: asyncio.Future[None] | None = None
         self._final: LinkStats | None = None
@@ -57,6 +59,7 @@ class Link:
         kind = self._lib.LINK_BULK if bulk else self._lib.LINK_CONTROL
         status = self._lib.io_send(self._live(), self._number, kind, data, len(content), min_clock, req_clock)
         self._check_command(status, len(content), "bulk" if bulk else "control")
+        self.on_sent()
 
     def send_batch(self, batch: "Buffer") -> None:
         """Queue the motion commands of a batch (format: batch.h), all or none; raises LinkError as send()."""
@@ -74,6 +77,7 @@ class Link:
                 f"{self._name}: a batch of {size} bytes ends within a record, or has a bad command"
             )
         self._check(status)
+        self.on_sent()
 
     def send_urgent(self, content: bytes) -> None:
         """Drop everything that is queued but unsent and send CONTENT next; raises LinkError as send().
@@ -102,7 +106,7 @@ class Link:
 
     def pending(self) -> int:
         """Return how many commands are not yet acknowledged, queued ones included."""
-        return self.stats().pending
+        return self._final.pending if self._final else int(self._raw_stats().pending)
 
     async def drained(self) -> None:
         """Wait until nothing is pending; raises LinkError when the link is lost or closed meanwhile."""
@@ -115,9 +119,7 @@ class Link:
         """Return the counters so far; after close(), the last ones."""
         if self._final:
             return self._final
-        raw = self._ffi.new("struct io_link_stats *")
-        self._check(self._lib.io_get_link_stats(self._bus.live(), self._number, raw))
-        return _convert(raw, self._lib)
+        return _convert(self._raw_stats(), self._lib)
 
     def close(self) -> None:
         """Forget the link; what is queued is dropped. Further calls do nothing."""
@@ -166,6 +168,11 @@ class Link:
             raise LinkError(self._failed)
         return self._bus.live()
 
+    def _raw_stats(self) -> Any:
+        raw = self._ffi.new("struct io_link_stats *")
+        self._check(self._lib.io_get_link_stats(self._bus.live(), self._number, raw))
+        return raw
+
     def _fail(self, text: str) -> None:
         self._failed = self._failed or text
         if self._drained:
@@ -191,6 +198,10 @@ class Link:
                 f"a block holds 1..{self._lib.WIRE_CONTENT_MAX} bytes"
             )
         self._check(status)
+
+
+def _ignore() -> None:
+    """Do nothing."""
 
 
 def _flow(raw: Any) -> Flow:

@@ -1,6 +1,7 @@
 """Regular queries of one node's clock, and a check for a restart when the node goes silent."""
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Final
 
@@ -38,6 +39,8 @@ class ClockKeeper:
         self._on_estimate = on_estimate
         self._on_sample = on_sample
         self._on_lost = on_lost
+        self._silence: asyncio.TimerHandle | None = None
+        """The next look for silence, while something was sent."""
         self._task = asyncio.get_running_loop().create_task(self._keep())
         self._task.add_done_callback(self._ended)
 
@@ -68,12 +71,36 @@ class ClockKeeper:
 
     async def _wait_watching(self, wait_s: float) -> None:
         """Wait, and have the bus check the node when it owes an acknowledgement and is silent."""
-        while wait_s > 0:
-            heard = self._talk.heard
-            await asyncio.sleep(min(wait_s, SILENCE_S))
-            wait_s -= SILENCE_S
-            if wait_s > 0 and heard == self._talk.heard and self._owes():
+        if self._talk.connected:
+            self._talk.link.on_sent = self._watch_silence
+        if self._owes():
+            self._watch_silence()
+        try:
+            await asyncio.sleep(wait_s)
+        finally:
+            self._end_watch()
+            if self._talk.connected:
+                self._talk.link.on_sent = _ignore
+
+    def _watch_silence(self) -> None:
+        """Look in SILENCE_S whether the node is silent, unless that is going to happen."""
+        if self._silence is None:
+            loop = asyncio.get_running_loop()
+            self._silence = loop.call_later(SILENCE_S, self._look_for_silence, self._talk.heard)
+
+    def _look_for_silence(self, heard: int) -> None:
+        self._silence = None
+        with contextlib.suppress(CanductorError):  # the link is lost, which is handled elsewhere
+            if not self._owes():
+                return  # the next command begins it again
+            if heard == self._talk.heard:
                 self._connector.suspect()
+            self._watch_silence()
+
+    def _end_watch(self) -> None:
+        if self._silence is not None:
+            self._silence.cancel()
+            self._silence = None
 
     def _owes(self) -> bool:
         return self._talk.connected and self._talk.link.pending() > 0
@@ -104,3 +131,7 @@ class ClockKeeper:
         if message.name == "clock":
             return self.estimator.add(sent_ns, received_ns, message.integer("clock"))
         return self.estimator.begin(sent_ns, received_ns, message.integer("high"), message.integer("clock"))
+
+
+def _ignore() -> None:
+    """Do nothing."""

@@ -12,7 +12,6 @@ from nodes.transport.base import (
     TransportClosedError,
 )
 from nodes.transport.frame import CanFrame
-from nodes.transport.python_can_bridge import PythonCanBridge
 from nodes.transport.socketcan import SocketCanTransport
 from nodes.transport.uart import BAUD_DEFAULT, UartTransport
 from nodes.transport.virtual import VirtualTransport
@@ -48,6 +47,8 @@ def open_can(spec: str, *, bitrate: int | None = None) -> CanTransport:
         return SocketCanTransport(interface, bitrate=bitrate)
     if interface == "virtual":
         return VirtualTransport(channel, bitrate=bitrate)
+    from nodes.transport.python_can_bridge import PythonCanBridge  # noqa: PLC0415 (3 MB, for who uses it)
+
     return PythonCanBridge.open(interface, channel, bitrate=bitrate)
 
 

@@ -191,6 +191,7 @@ class TwinLink:
         self.receive_window = 192
         self.clocks: list[tuple[float, int, int]] = []
         self.sent: list[tuple[bytes, int, int]] = []
+        self.on_sent: Callable[[], None] = lambda: None
 
     def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False) -> None:
         assert not self.closed

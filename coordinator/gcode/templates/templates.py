@@ -7,13 +7,13 @@ Jinja2 with ``{`` and ``}`` around values. A template is checked here, and rende
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any, Final
-
-from jinja2 import TemplateSyntaxError
+from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.gcode.templates.renderer import Actions, RenderingFailed, template_renderer
-from coordinator.gcode.templates.sandbox import Sandbox
 from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.gcode.templates.sandbox import Sandbox
 
 _NOTHING: Final[Mapping[str, Any]] = {}
 
@@ -75,6 +75,8 @@ class Template:
 
 @lru_cache(maxsize=1000)
 def _check(text: str) -> None:
+    from jinja2 import TemplateSyntaxError  # noqa: PLC0415 (4 MB, for machines with templates)
+
     try:
         _sandbox().prepared(text)
     except TemplateSyntaxError as error:
@@ -84,7 +86,9 @@ def _check(text: str) -> None:
 
 
 @cache
-def _sandbox() -> Sandbox:
+def _sandbox() -> "Sandbox":
+    from coordinator.gcode.templates.sandbox import Sandbox  # noqa: PLC0415 (imports jinja2)
+
     return Sandbox()
 
 

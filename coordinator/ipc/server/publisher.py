@@ -36,6 +36,7 @@ class Publisher:
 
     def body(self, wanted: FieldFilter, since: int, encoding: Encoding) -> bytes | None:
         """Return the last three entries of an update, None when nothing WANTED changed after SINCE."""
+        self.state.bring_up_to_date()
         if self.state.sequence != self._bodies_of:
             self._bodies.clear()
             self._bodies_of = self.state.sequence

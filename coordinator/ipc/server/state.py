@@ -3,10 +3,12 @@
 Every change gets the next sequence number. A watcher that has seen everything up to one number asks for what
 changed since: only the newest value of each field, however long it was away. So a slow watcher costs nothing:
 there is no queue for it, only the tree itself, one value and one number per field.
+
+Reading calls ``bring_up_to_date`` first, so that nobody has to fill a tree that is not looked at.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -94,6 +96,8 @@ class StateTree:
         self.sequence = 0
         self.refused = 0
         """Changes refused because the tree is full."""
+        self.bring_up_to_date: Callable[[], None] = lambda: None
+        """Puts in what was not put in all along; set by the owner of the values."""
         self._fields: dict[str, tuple[Value, int]] = {}  # in the order of their last change
         self._removed: dict[str, int] = {}  # likewise
         self._forgotten = 0  # the newest removal that is not remembered any more
@@ -103,6 +107,11 @@ class StateTree:
 
     def get(self, path: str) -> Value:
         """Return the value at PATH; None where there is none."""
+        self.bring_up_to_date()
+        return self.latest(path)
+
+    def latest(self, path: str) -> Value:
+        """Return the value at PATH that was put in last; for who puts values in."""
         return self._fields.get(path, (None, 0))[0]
 
     def set(self, path: str, value: Value) -> None:
@@ -139,6 +148,7 @@ class StateTree:
 
     def snapshot(self, wanted: FieldFilter = EVERYTHING) -> Changes:
         """Return all fields that are WANTED."""
+        self.bring_up_to_date()
         values = {path: value for path, (value, _) in self._fields.items() if wanted.matches(path)}
         return Changes(0, self.sequence, values, snapshot=True)
 

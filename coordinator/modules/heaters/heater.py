@@ -39,10 +39,10 @@ LOOK_S: Final = 1.0
 SILENT_LOOKS: Final = 2
 """How many checks in a row may find none; not a time, as the host itself may have been suspended."""
 
-STALE_LOOK_S: Final = 0.1
-"""How often it is checked whether the power is based on a measurement that is too old."""
 STALE_SPARE_S: Final = 0.2
-"""How long before the node would stop such a power is switched off: two checks."""
+"""How long before the node would stop it a power is switched off that no measurement has renewed."""
+STALE_AGAIN_S: Final = 0.01
+"""Least time until the next check of that."""
 
 COMING_S: Final = 1.0
 """How far ahead filament that is going to pass is taken into account, from when a power acts."""
@@ -103,6 +103,8 @@ class Heater:
         self._applied_s = 0.0
         """When power was applied last, host's time."""
         self._stale_s = build.get(MAX_DURATION) - AHEAD_S - STALE_SPARE_S
+        self._stale_check: Callable[[], None] | None = None
+        """Cancels the check that waits for the moment at which the power is too old."""
         self._off_because: str | None = None
         """Why the target was cleared; None: it was not."""
         self._bad = 0
@@ -129,7 +131,6 @@ class Heater:
             live.machine.filament.want(self.name)
         await self.input.connect(live)
         live.every(LOOK_S, self._look)
-        live.every(STALE_LOOK_S, self._end_stale_heat)
 
     def keep(self, found: dict[str, str]) -> None:
         """Save what calibration FOUND with the next SAVE_CONFIG: options of the section and their values."""
@@ -140,7 +141,7 @@ class Heater:
 
     def end(self, cause: str) -> None:
         """Stop acting: the nodes have switched their outputs off."""
-        self._live = None
+        self._live = self._stale_check = None
         self.target_c = self.power = 0.0
         self._report_held(self._holding.end())
         self.input.end(cause)
@@ -308,12 +309,19 @@ class Heater:
             self._switch_off(str(error))
             return
         self._on, self._applied_s = power > 0, live.now_s()
+        if self._on and self._stale_check is None:
+            self._stale_check = live.after(self._stale_s, self._end_stale_heat)
 
     def _end_stale_heat(self) -> None:
         """Switch off when no measurement has renewed the power for too long: the temperature is unknown."""
-        live = self._live
-        if live is not None and self._on and live.now_s() - self._applied_s > self._stale_s:
+        live, self._stale_check = self._live, None
+        if live is None or not self._on:
+            return
+        left_s = self._stale_s - (live.now_s() - self._applied_s)
+        if left_s < 0:
             self._apply(0.0)
+        else:  # it was renewed since
+            self._stale_check = live.after(max(left_s, STALE_AGAIN_S), self._end_stale_heat)
 
     def _look(self) -> None:
         """Check that there still are measurements; stop the machine, or switch off, if there are none."""

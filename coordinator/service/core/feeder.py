@@ -7,7 +7,7 @@ passes between them are single attributes and deques, whose operations are atomi
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -101,6 +101,8 @@ class Feeder:
         self._pause_wanted = False
         self._cancel_wanted = False
         self._closed = False
+        self.on_call: Callable[[], None] = lambda: None
+        """Called on the control loop whenever ``step`` may have something to do that it had not before."""
         self.to_recover: deque[Recovering] = deque(maxlen=1)
         """For the control loop to take: a program wants the interrupted job to go on."""
         self.to_print: deque[str] = deque(maxlen=WAITING_MAX)
@@ -124,6 +126,12 @@ class Feeder:
     def busy(self) -> bool:
         """Whether anything is being done or waits."""
         return self._now is not None or self._held is not None or bool(self._waiting)
+
+    @property
+    def has_work(self) -> bool:
+        """Whether ``step`` has anything to do, or its results wait to be taken."""
+        interjections = self._interjections or self._interjection or self._interjection_events
+        return bool(self.busy or interjections or self.finished or self._closed)
 
     @property
     def active(self) -> bool:
@@ -152,6 +160,7 @@ class Feeder:
             raise FeederFull(f"{WAITING_MAX} requests wait for the machine already; wait for their answers")
         queued = QueuedWork(work, is_job)
         self._waiting.append(queued)
+        self.on_call()
         return queued
 
     def submit_interjection(self, lines: LinesWork) -> QueuedWork:
@@ -160,21 +169,26 @@ class Feeder:
             raise FeederFull(f"{INTERJECTIONS_MAX} requests wait already; wait for their answers")
         queued = QueuedWork(lines)
         self._interjections.append(queued)
+        self.on_call()
         return queued
 
     def pause(self) -> None:
         """Read no further: what is planned is carried out, to a standstill between two moves."""
         self._paused = True
+        self.on_call()
 
     def resume(self) -> None:
         """Go on with the next line."""
         self._paused = False
+        self.on_call()
 
     def cancel(self, queued: QueuedWork) -> None:
         """End QUEUED before its next line, also while it waits; what is planned of it is carried out."""
         queued.cancelled = True
         if (standstill := queued.standstill) is not None:
             standstill.cancelled = True
+        if not queued.done:
+            self.on_call()
 
     def cancel_all(self) -> None:
         """End what is being done and what waits, each before its next line."""
@@ -185,6 +199,7 @@ class Feeder:
     def close(self) -> None:
         """End: ``step`` answers End once all is planned."""
         self._closed = True
+        self.on_call()
 
     def abandon(self) -> None:
         """Release what works hold that will not be done any more; the worker has ended."""

@@ -42,7 +42,11 @@ from nodes.node.errors import NodeShutdown
 from nodes.support.errors import CanductorError
 
 REFRESH_S: Final = 0.1
-"""How often the state tree is brought up to date."""
+"""How often the state tree is brought up to date while somebody reads it."""
+UNREAD_S: Final = 1.0
+"""Likewise, while nobody does and something moves; at rest it is filled when somebody reads it."""
+READ_S: Final = 1.5
+"""So long after somebody has read it, it counts as being read."""
 BY_USER: Final = "emergency stop by"
 BY_INTERRUPT: Final = "stopped by the user"
 
@@ -127,6 +131,13 @@ class MachineService:
         self._cache = cache
         self._record = record
         self._figures = Figures(state)
+        self._shown_s = self._read_s = float("-inf")
+        """When the tree was brought up to date, and when somebody wanted it to be."""
+        self._reading = asyncio.Event()
+        """Set when ``_refresh`` has to go on: somebody reads the tree, or motion begins."""
+        self._refresh_rests = False
+        """Whether it waits for that."""
+        state.bring_up_to_date = self._bring_up_to_date
         self.recovery = Recovery(self, settings.state)
         self.programs = Programs(self, self.recovery)
         self.fed = FedJobs(self)
@@ -458,6 +469,8 @@ class MachineService:
         if wanted is not self.state:
             self._enter(wanted, held or "")
         self.tables.show_corrections()
+        if self._refresh_rests and self.moves:
+            self._reading.set()
 
     def _enter(self, state: ServiceState, cause: str = "") -> None:
         self.state, self.cause = state, cause
@@ -478,12 +491,31 @@ class MachineService:
         self.log.add("notice", text)
         self._on_output(Notice(0, text))
 
+    def _bring_up_to_date(self) -> None:
+        """Fill the tree for somebody who reads, unless ``_refresh`` has done so."""
+        self._read_s = self.now_s
+        self._reading.set()
+        if self._read_s - self._shown_s >= 2 * REFRESH_S:
+            self._shown_s = self._read_s
+            with contextlib.suppress(MachineStopped):
+                self._figures.show(self)
+
     async def _refresh(self) -> None:
+        """Keep the tree up to date while it is read; a look at it should find it filled."""
         while True:
             with contextlib.suppress(MachineStopped):
                 for _ in self._figures.parts(self):
                     await asyncio.sleep(0)
-            await asyncio.sleep(REFRESH_S)
+            self._shown_s = self.now_s
+            if self.now_s - self._read_s < READ_S:
+                await asyncio.sleep(REFRESH_S)
+                continue
+            self._reading.clear()
+            self._refresh_rests = not self.moves
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(None if self._refresh_rests else UNREAD_S):
+                    await self._reading.wait()
+            self._refresh_rests = False
 
 
 def _confirmations(confirmed_s: dict[str, float]) -> str:

@@ -60,7 +60,9 @@ class Motion:
             on_output=on_output,
             on_state=self._cycle_ended,
             on_cycle=on_cycle,
+            at_rest=self._at_rest,
         )
+        self.feeder.on_call = self.streamer.call
         self.begun = asyncio.Event()
         """Set once ``planned`` is known, or never will be: a moment after the machine is ready."""
         self.works = 0
@@ -150,6 +152,10 @@ class Motion:
             while True:
                 self._ending.append(self.feeder.finished.popleft())
         self._ending = [queued for queued in self._ending if not self._settle(queued, now_s)]
+
+    def _at_rest(self) -> bool:
+        """Return whether nothing is left to be done or reported."""
+        return not (self.feeder.has_work or self._ending)
 
     def _settle(self, queued: QueuedWork, now_s: float) -> bool:
         """Report QUEUED done once its last move is executed; return whether it is."""

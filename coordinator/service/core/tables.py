@@ -82,7 +82,7 @@ class TableService:
         """Show in the state tree what is corrected now."""
         if self._compensation is not None:
             for axis in self._compensation.states:
-                if axis in self._tables or self._tree.get(f"tables.{axis}.active") is not None:
+                if axis in self._tables or self._tree.latest(f"tables.{axis}.active") is not None:
                     self._tree.update(f"tables.{axis}", self._correction(axis))
 
     def _correction(self, axis: str) -> dict[str, Any]:

@@ -20,8 +20,10 @@ from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
 
-RECENT_LOOKS: Final = 10
-"""A lead is recent for so many looks: about a second."""
+RECENT_S: Final = 0.95
+"""A lead is recent for so long, or since the last look where that is longer ago."""
+LOOKS_MAX: Final = 32
+"""That are kept within that time."""
 _NOT_IN_A_PATH = re.compile(r"[^A-Za-z0-9_-]")
 
 
@@ -149,15 +151,17 @@ class _RecentLead:
     """The smallest lead of the last second, from two histograms."""
 
     def __init__(self) -> None:
-        self._seen: deque[tuple[int, ...]] = deque(maxlen=RECENT_LOOKS)
+        self._seen: deque[tuple[float, tuple[int, ...]]] = deque(maxlen=LOOKS_MAX)
 
-    def look(self, histogram: tuple[int, ...]) -> float | None:
+    def look(self, histogram: tuple[int, ...], now_s: float) -> float | None:
         """Take the newest histogram; return where the lowest bin that grew begins, ms.
 
         None: no motion command was acknowledged.
         """
-        before = self._seen[0] if self._seen else histogram
-        self._seen.append(histogram)
+        while len(self._seen) > 1 and self._seen[1][0] <= now_s - RECENT_S:
+            self._seen.popleft()
+        before = self._seen[0][1] if self._seen else histogram
+        self._seen.append((now_s, histogram))
         if len(before) != len(histogram):
             return None
         grown = (k for k, (a, b) in enumerate(zip(before, histogram, strict=True)) if b > a)
@@ -193,7 +197,7 @@ def node_figures(machine: "Machine", node: Node, recent: _RecentLead) -> dict[st
         stats = link_of(node).stats()
     except CanductorError:
         return figures  # as it was last seen
-    return figures | _link(stats, recent)
+    return figures | _link(stats, recent, machine.host.now() * 1e-9)
 
 
 def _firmware(node: Node) -> dict[str, Value]:
@@ -229,7 +233,7 @@ def _clock(node: Node) -> dict[str, Value]:
     }
 
 
-def _link(stats: LinkStats, recent: _RecentLead) -> dict[str, Value]:
+def _link(stats: LinkStats, recent: _RecentLead, now_s: float) -> dict[str, Value]:
     histogram: Value = list(stats.lead_histogram)
     return {
         "round_trip_ms": round(stats.srtt_s * 1e3, 3),
@@ -241,7 +245,7 @@ def _link(stats: LinkStats, recent: _RecentLead) -> dict[str, Value]:
         "retransmitted_blocks": stats.blocks_repeated,
         "retransmitted_bytes": stats.bytes_repeated,
         "invalid_bytes": stats.bytes_invalid,
-        "lead_ms": recent.look(stats.lead_histogram),
+        "lead_ms": recent.look(stats.lead_histogram, now_s),
         "lead_min_ms": _ms(stats.min_lead_s),
         "lead_histogram": histogram,
     }

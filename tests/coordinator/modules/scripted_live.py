@@ -64,6 +64,7 @@ class ScriptedLive:
         self.stops: list[str] = []
         self.saved: list[tuple[str, str, str]] = []
         self.timers: list[tuple[float, Callable[[], None]]] = []
+        self.later: list[tuple[float, Callable[[], None]]] = []
 
     @property
     def machine(self) -> "ScriptedLive":
@@ -88,6 +89,10 @@ class ScriptedLive:
 
     def every(self, seconds: float, call: Callable[[], None]) -> None:
         self.timers.append((seconds, call))
+
+    def after(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
+        self.later.append((seconds, call))
+        return lambda: None
 
     def save(self, section: str, option: str, text: str) -> None:
         self.saved.append((section, option, text))

@@ -22,9 +22,17 @@ class OwingLink(TwinLink):
     """Says how many commands the node has not acknowledged."""
 
     owed = 0
+    looks = 0
+    """How often that was asked for."""
 
     def pending(self) -> int:
+        self.looks += 1
         return self.owed
+
+    def queue(self) -> None:
+        """Queue a command that the node does not acknowledge."""
+        self.owed += 1
+        self.on_sent()
 
 
 class Bench:
@@ -164,7 +172,7 @@ def test_a_node_that_owes_answers_and_says_nothing_is_suspected_every_quarter_of
     async def main(keeper: ClockKeeper) -> None:
         await keeper.ready.wait()
         sampled_s = bench.sampled_s[-1]
-        bench.link.owed = 1
+        bench.link.queue()
         await asyncio.sleep(0.98)
         assert [t - sampled_s for t in bench.suspected_s] == pytest.approx([0.25, 0.5, 0.75], abs=1e-6)
         await asyncio.sleep(0.1)
@@ -177,6 +185,24 @@ def test_a_node_that_owes_answers_and_says_nothing_is_suspected_every_quarter_of
         assert bench.suspected_s == []
         bench.talk.detach()
         await asyncio.sleep(0.25)
+        assert bench.suspected_s == []
+
+    bench.run(main)
+
+
+def test_silence_is_looked_for_only_after_something_was_sent() -> None:
+    bench = Bench()
+
+    async def main(keeper: ClockKeeper) -> None:
+        await keeper.ready.wait()
+        await asyncio.sleep(0.1)
+        bench.link.looks, samples = 0, len(bench.sampled_s)
+        await asyncio.sleep(9.9)
+        assert bench.link.looks == len(bench.sampled_s) - samples == 10, "one for each sample, none between"
+        bench.link.queue()
+        bench.link.owed = 0  # acknowledged at once
+        await asyncio.sleep(0.5)
+        assert bench.link.looks == 11
         assert bench.suspected_s == []
 
     bench.run(main)

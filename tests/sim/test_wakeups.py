@@ -1,0 +1,66 @@
+"""How often the coordinator wakes up, in virtual time: at rest, for a line of a client, while printing."""
+
+import asyncio
+from pathlib import Path
+
+from coordinator.simulate.scenario import load
+from coordinator.simulate.stage import Stage
+from coordinator.streaming.streamer import FULL_CYCLE_S, REST_CYCLE_S
+from coordinator.streaming.worker import SEND_AHEAD_S
+from tests.stages.served import Served, running, zigzag
+
+CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
+REST_S = 10.0
+SCRIPT_S = 0.005
+"""In virtual time, which does not pass while anything is computed: a wait for the next cycle would show."""
+SETTLE_S = 1.5
+"""Until the tree is not read any more."""
+
+
+def test_nothing_is_polled(tmp_path: Path) -> None:
+    world = Stage(load(CLEAN), 5)
+
+    async def rest(stage: Served) -> None:
+        motion = stage.service.motion
+        assert motion is not None
+        cycles, sequence = motion.streamer.cycles, stage.tree.sequence
+        await asyncio.sleep(REST_S)
+        assert motion.streamer.cycles - cycles <= REST_S / REST_CYCLE_S + 1
+        assert stage.tree.sequence == sequence, "nobody reads the tree, so nobody fills it"
+        print_time_s = stage.tree.get("position.print_time_s")
+        assert isinstance(print_time_s, float)
+        assert abs(print_time_s - motion.now_s) < 0.001, "it is filled when somebody reads it"
+
+    async def ask(stage: Served) -> None:
+        loop = asyncio.get_running_loop()
+        for pause_s in (0.0, 0.313, 0.777, 1.234):
+            await asyncio.sleep(pause_s)
+            begun_s = loop.time()
+            await stage.call("gcode.run", script="M220 S100")
+            assert loop.time() - begun_s <= SCRIPT_S
+
+    async def print_file(stage: Served) -> None:
+        motion = stage.service.motion
+        assert motion is not None
+        stage.write_job(zigzag(150, 5))
+        await stage.call("job.start", file="job.gcode")
+        await asyncio.sleep(6.0)
+        lead_s, cycles = motion.lead.now_s, motion.streamer.cycles
+        assert lead_s is not None
+        assert lead_s >= SEND_AHEAD_S - FULL_CYCLE_S - 0.01
+        await asyncio.sleep(3.0)
+        assert motion.streamer.cycles - cycles <= 3.0 / FULL_CYCLE_S + 2
+        await stage.until_job("done")
+        await stage.check_positions()
+
+    async def go() -> None:
+        async with running(Served(tmp_path, lambda: world.description, world.host)) as stage:
+            await asyncio.sleep(SETTLE_S)
+            await rest(stage)
+            await ask(stage)
+            await print_file(stage)
+            await asyncio.sleep(2 * SETTLE_S)
+            await rest(stage)
+
+    with asyncio.Runner(loop_factory=world.make_loop) as runner:
+        runner.run(go())
