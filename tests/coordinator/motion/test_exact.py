@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coordinator.verification.exact_path import INVERSE, Leg, Setting, StepperPath, places, resting, solve
+from coordinator.verification.exact_path import INVERSE, Leg, Setting, StepperPath, places, solve
 from coordinator.verification.exact_signal import Floats, Phases, Shaped, Smoothed
 from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
 from tests.coordinator.motion.exact_check import Epoch, StepperProof, check
@@ -202,7 +202,7 @@ def test_every_crossing_is_counted_and_solved(kind: str, setting: Setting) -> No
     t: Floats = np.linspace(0.9, end, 200_001)
     place = np.floor(path.u(t) + 0.5).astype(np.int64)
     _, turns, done = places(path)
-    count, last = int(np.abs(np.diff(done)).sum()), resting(float(turns[-1]))
+    count, last = int(np.abs(np.diff(done)).sum()), int(done[-1])
     assert count == pytest.approx(int(np.abs(np.diff(place)).sum()), abs=4), "pairs between two samples"
     assert last == place[-1]
     at = np.flatnonzero(np.abs(np.diff(place)) == 1)
