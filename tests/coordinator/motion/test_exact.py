@@ -201,7 +201,7 @@ def test_every_crossing_is_counted_and_solved(kind: str, setting: Setting) -> No
     assert path.u(np.array([0.5]))[0] == pytest.approx(0, abs=1e-9)
     t: Floats = np.linspace(0.9, end, 200_001)
     place = np.floor(path.u(t) + 0.5).astype(np.int64)
-    _, turns, done = places(path)
+    _, _, done = places(path)
     count, last = int(np.abs(np.diff(done)).sum()), int(done[-1])
     assert count == pytest.approx(int(np.abs(np.diff(place)).sum()), abs=4), "pairs between two samples"
     assert last == place[-1]
