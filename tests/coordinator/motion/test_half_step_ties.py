@@ -88,9 +88,10 @@ def generated(of: Program) -> Stream:
     if of.setting.smooth_s:
         gen.set_smooth_time(0, of.setting.smooth_s)
     assert gen.append(of.moves, len(of.moves)) == len(of.moves)
-    end = float(of.moves[-1]["print_time"]) + 1.0
+    last = of.moves[-1]
+    end = float(last["print_time"] + last["accel_s"] + last["cruise_s"] + last["decel_s"]) + 0.5
     batch = bytearray()
-    for until in [*np.arange(1.0, end - 0.5, CUT_S), end]:
+    for until in [*np.arange(1.0, end, CUT_S), end]:
         while not gen.generate(float(until), flush=until == end):
             batch += gen.take_batch(0)
         while piece := gen.take_batch(0):
