@@ -25,6 +25,11 @@ class CanConnection:
     """``can0`` (SocketCAN), ``virtual:PATH`` or ``INTERFACE:CHANNEL`` in python-can's words."""
     place: Place
 
+    @property
+    def address(self) -> str:
+        """By which the node is known again."""
+        return f"can {self.uuid}"
+
 
 @dataclass(frozen=True, slots=True)
 class UartConnection:
@@ -34,6 +39,11 @@ class UartConnection:
     baud: int
     restart_method: ResetMethod
     place: Place
+
+    @property
+    def address(self) -> str:
+        """By which the node is known again."""
+        return f"serial {self.path}"
 
 
 class NodePolicy(Enum):
