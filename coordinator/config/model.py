@@ -137,6 +137,11 @@ class HomingDescription:
         return self.endstop_pin is not None and self.virtual_endstop == PROBE_ENDSTOP
 
     @property
+    def is_sensorless(self) -> bool:
+        """Whether a stall of the motor is the endstop."""
+        return self.virtual_endstop.startswith("tmc")
+
+    @property
     def waits(self) -> bool:
         """Whether its endstop is one that no module offers yet."""
         return self.endstop_pin is None and bool(self.virtual_endstop)
