@@ -403,8 +403,8 @@ def _pressed_cure(rail: RailDescription) -> str:
             "move the axis away by hand, or check the endstop's wiring and whether its pin has to be inverted"
         )
     return (
-        "the motor still reports a stall, most likely because the axis stands at its end while another one moves"
-        " along it: let one axis leave its end first (docs/tmc.md, Homing without switches)"
+        "the motor still reports a stall, most likely because the axis stands at its end while another one"
+        " moves along it: let one axis leave its end first (docs/tmc.md, Homing without switches)"
     )
 
 
