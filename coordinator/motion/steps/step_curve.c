@@ -401,12 +401,11 @@ static void note_tie(const struct step_gen *gen, struct stepper *s, const struct
                      double to, double begin, double end) {
     const int direction = end > begin ? 1 : -1;
     const double boundary = (double)s->position + 0.5 * direction;
-    if (end == begin || (end - boundary) * direction <= 0) {
-        s->crossed_direction = 0;
-    } else if ((begin - boundary) * direction <= 0) {
+    const bool beyond = end != begin && (end - boundary) * direction > 0;
+    if (beyond && (begin - boundary) * direction <= 0) {
         s->crossed = p->begin + solve(gen, s, p, from, to, from, direction, boundary);
         s->crossed_direction = direction;
-    } else if (s->crossed_direction != direction) {
+    } else if (!beyond || s->crossed_direction != direction) {
         s->crossed_direction = 0;
     }
 }
