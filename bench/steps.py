@@ -144,7 +144,8 @@ def single(v: float, length: float, moves: int, accel_share: float) -> Rows:
         ramp = v / accel if accel else 0.0
         cruise = length * (1 - accel_share) / v
         start, way = (0.0, 1.0) if i % 2 == 0 else (length, -1.0)
-        rows.append([t, ramp, cruise, ramp, 0.0 if accel else v, v, accel, start, 0, 0, 0, way, 0, 0, 0])
+        rest = [0.0 if accel else v, v, accel, start, 0, 0, 0, way, 0, 0, 0, 0, 0]
+        rows.append([t, ramp, cruise, ramp, *rest])
         t += 2 * ramp + cruise
     return np.array(rows)
 

@@ -52,13 +52,14 @@ def _module_sections() -> dict[str, SectionSpec]:
     return beside | {title: module.SPEC for title, module in own_modules()}
 
 
-def _spec(title: str) -> SectionSpec:
+def reference_spec(title: str) -> SectionSpec:
+    """Return the specification of a section by its title."""
     return SECTIONS.get(title) or _module_sections()[title]
 
 
 def section_json(title: str) -> dict[str, object]:
     """Return one section's purpose and options."""
-    spec = _spec(title)
+    spec = reference_spec(title)
     return {
         "help": spec.help,
         "options": [
@@ -76,7 +77,7 @@ def section_json(title: str) -> dict[str, object]:
 
 def section_table(title: str) -> str:
     """Return one section's heading, purpose and options in Markdown."""
-    spec = _spec(title)
+    spec = reference_spec(title)
     lines = [
         f"### `{title}`",
         "",

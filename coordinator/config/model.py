@@ -25,6 +25,11 @@ class CanConnection:
     """``can0`` (SocketCAN), ``virtual:PATH`` or ``INTERFACE:CHANNEL`` in python-can's words."""
     place: Place
 
+    @property
+    def address(self) -> str:
+        """By which the node is known again."""
+        return f"can {self.uuid}"
+
 
 @dataclass(frozen=True, slots=True)
 class UartConnection:
@@ -34,6 +39,11 @@ class UartConnection:
     baud: int
     restart_method: ResetMethod
     place: Place
+
+    @property
+    def address(self) -> str:
+        """By which the node is known again."""
+        return f"serial {self.path}"
 
 
 class NodePolicy(Enum):
@@ -125,6 +135,11 @@ class HomingDescription:
     def by_probe(self) -> bool:
         """Whether its endstop is the probe, which acts."""
         return self.endstop_pin is not None and self.virtual_endstop == PROBE_ENDSTOP
+
+    @property
+    def is_sensorless(self) -> bool:
+        """Whether a stall of the motor is the endstop."""
+        return self.virtual_endstop.startswith("tmc")
 
     @property
     def waits(self) -> bool:

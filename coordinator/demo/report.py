@@ -30,6 +30,8 @@ class DemoReport:
     frames: int
     frames_lost: int
     notices: tuple[str, ...]
+    sensorless: frozenset[str] = frozenset()
+    """Axes that are homed by the stall of a motor."""
 
     @property
     def ok(self) -> bool:
@@ -105,24 +107,42 @@ class DemoReport:
             f"{outcome.moves:,} moves in {outcome.print_time_s:.1f} s, {outcome.queue_steps:,} queue_step "
             f"commands; {self.frames:,} CAN frames, {self.frames_lost:,} of them lost on purpose"
         )
-        lines.append(
-            "PROVED: every stepper stands where the plan says; no step early, late or lost"
-            if self.ok
-            else f"FAILED: {self._failures()}; please report this with the output above"
-        )
+        lines.append(self.verdict())
         return "\n".join(lines)
 
-    def _failures(self) -> str:
-        failed = [s.stepper for s in self.steppers if not s.holds]
-        if failed:
-            return f"{', '.join(failed)} did not do what was planned"
-        lost = [p.axis for p in self.places if not p.holds]
-        if lost:
-            return f"{', '.join(lost)} is not at the position that the machine believes"
-        cold = [heat.heater for heat in self.heat if not heat.holds]
-        if cold:
-            return f"{', '.join(dict.fromkeys(cold))} left the target in steady state"
-        return f"{self.stray_edges} level changes of pins that the configuration does not use"
+    def verdict(self) -> str:
+        """Return in a sentence whether all was proved, and what most likely is the cause if not."""
+        if self.ok:
+            return "PROVED: every stepper stands where the plan says; no step early, late or lost"
+        return f"FAILED: {'; '.join(self.failures())}; {self._cure()}"
+
+    def failures(self) -> list[str]:
+        """Return everything that was not proved, a phrase each."""
+        found = []
+        if failed := [s.stepper for s in self.steppers if not s.holds]:
+            found.append(f"{', '.join(failed)} did not do what was planned")
+        if lost := self._lost():
+            found.append(f"{', '.join(lost)} is not at the position that the machine believes")
+        if cold := [heat.heater for heat in self.heat if not heat.holds]:
+            found.append(f"{', '.join(dict.fromkeys(cold))} left the target in steady state")
+        if self.stray_edges:
+            found.append(f"{self.stray_edges} level changes of pins that the configuration does not use")
+        return found
+
+    def _lost(self) -> list[str]:
+        return [place.axis for place in self.places if not place.holds]
+
+    def _cure(self) -> str:
+        """Return the likely cause first, where there is one that is not ours."""
+        report = "please report this with the output above"
+        without_switch = [axis for axis in self._lost() if axis in self.sensorless]
+        if not without_switch:
+            return report
+        return (
+            f"{', '.join(without_switch)} is homed without a switch, so most likely it stood at its end while"
+            " another axis was homed along it: let one axis leave its end first (docs/tmc.md, Homing without"
+            f" switches); if that is not it, {report}"
+        )
 
 
 def report_of(
@@ -147,6 +167,7 @@ def report_of(
         frames=frames,
         frames_lost=frames_lost,
         notices=tuple(notices),
+        sensorless=prover.sensorless(),
     )
 
 

@@ -21,6 +21,6 @@ class PlanOptions:
     json: bool = False
     """Show no progress."""
     dictionaries: Mapping[str, Path] = field(default_factory=dict)
-    """By node: its data dictionary as JSON; other nodes use the project's own firmware."""
+    """By node: its data dictionary as JSON; for others see ``node_dictionaries``."""
     tables: Mapping[str, Path] = field(default_factory=dict)
     """By axis: its compensation table, a CSV or a COMP_FILE of type 0 in mm."""

@@ -2,7 +2,6 @@
 
 import time
 from contextlib import ExitStack
-from pathlib import Path
 from typing import BinaryIO
 
 from coordinator.assembly.load import load_machine
@@ -26,6 +25,7 @@ from coordinator.motion.planner.planner import Planner
 from coordinator.motion.steps.errors import StepError
 from coordinator.motion.steps.steps import StepGenerator
 from coordinator.planning.figures import PlanFigures
+from coordinator.planning.node_dictionaries import node_dictionaries
 from coordinator.planning.options import PlanOptions
 from coordinator.planning.report import PlanReport
 from coordinator.planning.summary import PlanResult, watched_nodes, write_files
@@ -37,20 +37,23 @@ from coordinator.support.progress import Progress as Shown
 from coordinator.support.progress import ProgressDisplay
 from coordinator.tables.axis_table import TableError
 from coordinator.tables.files import read_table
-from nodes.dictionary.dictionary import Dictionary
+from nodes.dictionary.cache import DictionaryCache
 from nodes.support.errors import CanductorError
-from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
 
 ASSUMED_MOVE_COUNT = 1024
 """Queue slots of a node that is not there to be asked."""
 
 
-def plan_file(options: PlanOptions) -> PlanReport:
-    """Plan OPTIONS.gcode for OPTIONS.config; raises CanductorError."""
+def plan_file(options: PlanOptions, *, cache: DictionaryCache | None = None) -> PlanReport:
+    """Plan OPTIONS.gcode for OPTIONS.config; raises CanductorError.
+
+    CACHE: of dictionaries; by default, the user's.
+    """
     description = load_machine(str(options.config))
     modules = build_modules(description)
     devices = MachineDevices(description, modules.configure)
-    dictionaries = _dictionaries(description, options)
+    known = node_dictionaries(description, options, cache if cache is not None else DictionaryCache.of_user())
+    dictionaries = {name: node.dictionary for name, node in known.items()}
     for node in description.nodes:
         devices.build_config(node.name, dictionaries[node.name])
     streams = stream_specs((name, dictionaries[name], ASSUMED_MOVE_COUNT) for name in devices.moving_nodes)
@@ -84,7 +87,8 @@ def plan_file(options: PlanOptions) -> PlanReport:
         raise CanductorError(
             f"{figures.bad_records} emitted commands make no sense; this is a bug of step generation"
         )
-    chips = {name: dictionary.str_constant("MCU", "") for name, dictionary in dictionaries.items()}
+    chips = {name: node.chip for name, node in known.items()}
+    notices = [*(node.notice for node in known.values() if node.notice), *notices]
     made = PlanResult(description, pipeline, figures, streams, specs, chips, notices, end.print_time_s)
     return write_files(options, made.report())
 
@@ -104,32 +108,6 @@ def _with_line(error: StepError, program: str, figures: PlanFigures) -> Canducto
     if error.print_time_s is None:
         return error
     return CanductorError(f"{program}, near line {figures.line(error.print_time_s)}: {error}")
-
-
-def _dictionaries(description: MachineDescription, options: PlanOptions) -> dict[str, Dictionary]:
-    names = [node.name for node in description.nodes]
-    for name in options.dictionaries:
-        if name not in names:
-            raise CanductorError(
-                f"--dictionary {name}: the machine has no such node; it has {', '.join(names)}"
-            )
-    return {
-        name: _read_dictionary(options.dictionaries[name])
-        if name in options.dictionaries
-        else firmware_dictionary(MAINBOARD if name == names[0] else TOOLHEAD)
-        for name in names
-    }
-
-
-def _read_dictionary(path: Path) -> Dictionary:
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise CanductorError(f"cannot read the dictionary {path}: {error.strerror}; check the path") from None
-    try:
-        return Dictionary.from_json(text)
-    except CanductorError as error:
-        raise CanductorError(f"{path}: {error}") from None
 
 
 def _output_files(options: PlanOptions, nodes: list[str]) -> list[BinaryIO]:

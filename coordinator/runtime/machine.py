@@ -385,7 +385,11 @@ class Machine:
         self._bus_of[node] = bus
 
     def _build_config(self, node: NodeDescription) -> Callable[[Dictionary], NodeConfig]:
-        return lambda dictionary: self.devices.build_config(node.name, dictionary)
+        def build(dictionary: Dictionary) -> NodeConfig:
+            self._cache.remember(node.connection.address, dictionary)
+            return self.devices.build_config(node.name, dictionary)
+
+        return build
 
     async def _bring_back(self, node: Node) -> None:
         await node.restart()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from coordinator.motion.specs import StepperSpec
 from coordinator.verification.exact_bed import ExactBed
 from coordinator.verification.exact_signal import REST_S, Floats, Phases, Shaped, Signal, Smoothed
+from coordinator.verification.half_steps import all_settled
 
 Ints = NDArray[np.int64]
 Impulses = tuple[tuple[float, float], ...]
@@ -22,7 +23,6 @@ Impulses = tuple[tuple[float, float], ...]
 Position = tuple[float, float, float, float]
 AxisSignal = Signal | Shaped | Smoothed
 UNSHAPED: Impulses = ((1.0, 0.0),)
-SNAP = 65536
 PARTS_OF_PATCH = 8
 """A piece over a bed is looked at in so many parts of a patch's width, and in so many at least."""
 FORMULAS_WITH_Z = ("delta", "deltesian", "winch", "rotary_delta")
@@ -32,9 +32,6 @@ SAMPLES = 7
 """Of the slope, per piece: a cubic has at most two turns inside."""
 HALVINGS = 60
 GRID = 64
-NOISE_STEPS = 1e-7
-"""A stepper whose place changes by less stands, if it lasts longer than STANDS_S."""
-STANDS_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -223,11 +220,6 @@ def _axis(axis: int, weight: float, phases: Phases, setting: Setting) -> AxisSig
 # -------------------------------------------------------------------------------------------- solving
 
 
-def resting(u: float) -> int:
-    """Return the steps of a stepper that rests at U: a half goes up, 1/65536 of a step decides no tie."""
-    return math.floor(round(u * SNAP) / SNAP + 0.5)
-
-
 def solve(path: StepperPath, boundary: Floats, direction: Ints, near: Floats, reach_s: float) -> Floats:
     """Return when u crosses BOUNDARY in DIRECTION, each within REACH_S of NEAR (s); NaN where it does not.
 
@@ -306,36 +298,16 @@ def _turns(path: StepperPath, begin: Floats, end: Floats) -> Floats:
     return low
 
 
-def standing(t: Floats, u: Floats) -> NDArray[np.bool_]:
-    """Return at which of the turning points T the stepper stands, before it or behind it."""
-    stretch = (np.abs(np.diff(u)) < NOISE_STEPS) & (np.diff(t) > STANDS_S)
-    ends = np.concatenate(([True], stretch, [True]))
-    both: NDArray[np.bool_] = ends[:-1] | ends[1:]
-    return both
+def places(path: StepperPath, standing: int = 0) -> tuple[Floats, Floats, Ints]:
+    """Return the turning points (s), u there, and how many steps are done at each.
 
-
-def between_rests(u: Floats, snapped: Floats) -> Floats:
-    """Return the steps done at each turning point where it does not rest: nothing snaps.
-
-    As close to a boundary as rounding reaches it is where it was before.
+    STANDING: the step at which the stepper stands before.
     """
-    place = np.floor(u + 0.5)
-    for i in np.flatnonzero(np.abs(u - np.floor(u) - 0.5) < NOISE_STEPS):
-        before = place[i - 1] if i else snapped[i]
-        place[i] = min(max(before, math.floor(u[i])), math.floor(u[i]) + 1)
-    return place
-
-
-def places(path: StepperPath) -> tuple[Floats, Floats, Floats]:
-    """Return the turning points (s), u there, and how many steps are done at each."""
     t = turning_points(path)
     u = path.u(t)
     if path.spec.formula == "polar_angle":
         u = np.unwrap(u, period=math.tau / path.spec.step_distance)
-    place = np.floor(np.round(u * SNAP) / SNAP + 0.5)
-    if path.curved:
-        place = np.where(standing(t, u), place, between_rests(u, place))
-    return t, u, place
+    return t, u, all_settled(u, standing)
 
 
 @dataclass(frozen=True)
@@ -356,11 +328,11 @@ class Leg:
         return self.spec.formula is None and not self.setting.acts_on(self.spec.weights)
 
 
-def follow(legs: Iterable[Leg]) -> Iterator[tuple[StepperPath, Floats, Floats, Floats]]:
+def follow(legs: Iterable[Leg]) -> Iterator[tuple[StepperPath, Floats, Floats, Ints]]:
     """Yield the path of each leg with its ``places``."""
-    at = 0.0
+    at, standing = 0.0, 0
     for leg in legs:
-        path = StepperPath(leg.spec, leg.start, leg.moves, leg.setting, resting(at) if leg.declared else at)
-        t, u, place = places(path)
+        path = StepperPath(leg.spec, leg.start, leg.moves, leg.setting, standing if leg.declared else at)
+        t, u, place = places(path, standing)
         yield path, t, u, place
-        at = float(u[-1])
+        at, standing = float(u[-1]), int(place[-1])

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.verification.half_steps import all_settled
+
 _CHUNK = 4096
 """Trapezoids looked at together: bounds the memory of long programs."""
 
@@ -79,11 +81,13 @@ def _crossings(phases: _Phases, before: Ints, after: Ints) -> ExpectedSteps:
     nth = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
     direction = np.sign(after - before)[which]
     boundary = before[which] + direction * (nth + 0.5)
-    way = boundary - phases.position[which]
+    # A boundary that the phase before passed by less than decides a tie is due at once.
+    way = direction * np.maximum(direction * (boundary - phases.position[which]), 0)
     v, a = phases.velocity[which], phases.acceleration[which]
     # The root of way = v·t + a·t²/2 in the form that does not cancel when a is small or zero.
     root = np.sqrt(np.maximum(v * v + 2 * a * way, 0))
-    t = 2 * way / (v + direction * root)
+    speed = v + direction * root
+    t = np.divide(2 * way, speed, out=np.zeros_like(way), where=speed != 0)
     t = np.clip(t, 0, phases.duration[which])
     return ExpectedSteps(phases.begin[which] + t, direction.astype(np.int8))
 
@@ -97,15 +101,16 @@ def expected_steps(
     """Yield the steps that MOVES (struct trapezoid, in order) ask of one stepper.
 
     A stepper stands at step round((position - ORIGIN) / STEP_DISTANCE), position being the weighted sum of
-    the axes in mm; it steps when its position crosses the middle between two steps.
+    the axes in mm; it steps when its position crosses the middle between two steps. Where a phase ends at the
+    middle, it stays where it came from (``half_steps``).
     """
     weight = np.array(weights)
     standing: int | None = None
     for at in range(0, len(moves), _CHUNK):
         phases = _phases(moves[at : at + _CHUNK], weight, step_distance, origin)
-        after = np.floor(phases.end + 0.5).astype(np.int64)
         if standing is None:
             standing = int(np.floor(phases.position[0] + 0.5))
+        after = all_settled(phases.end, standing)
         # A phase begins where the one before it ended, whatever the last bit of its own start says.
         before = np.concatenate(([standing], after[:-1]))
         standing = int(after[-1])

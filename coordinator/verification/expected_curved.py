@@ -27,9 +27,9 @@ def expected_curved(legs: Sequence[Leg], clock_freq: float) -> Iterator[Expected
         yield ExpectedSteps(times[keep], directions[keep].astype(np.int8))
 
 
-def _steps(path: StepperPath, turns: Floats, u: Floats, place: Floats) -> tuple[Floats, Ints]:
+def _steps(path: StepperPath, turns: Floats, u: Floats, place: Ints) -> tuple[Floats, Ints]:
     """Return times and directions of the steps of PATH, given its places."""
-    change = np.diff(place).astype(np.int64)
+    change = np.diff(place)
     count = np.abs(change).astype(np.intp)  # on 32 bits, repeat() takes no longer numbers
     which = np.repeat(np.arange(len(count)), count)
     nth = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)

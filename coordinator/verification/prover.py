@@ -57,6 +57,10 @@ class Prover:
         """Prove where what was homed stands."""
         return prove_places(self._description, self._record, hardware.axes, hardware.motors())
 
+    def sensorless(self) -> frozenset[str]:
+        """Return the axes that are homed by the stall of a motor."""
+        return frozenset(rail.axis for rail in self._description.stops if rail.homing.is_sensorless)
+
     def clocks(self) -> list[ClockProof]:
         """Measure the clocks of the secondary nodes that step."""
         primary = self._description.nodes[0].name

@@ -8,6 +8,7 @@ all the bounds of a download. An invalid file is ignored and replaced by the nex
 import asyncio
 import contextlib
 import hashlib
+import json
 import os
 import re
 import stat
@@ -26,6 +27,9 @@ MAX_KEPT: Final = 64
 _NAME: Final = re.compile(r"[A-Za-z0-9_.+-]{1,40}-([0-9a-f]{64})\.dict\Z")
 _NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9_.+-]+")
 _TEMPORARY: Final = ".new-"
+_ADDRESSES: Final = "nodes.json"
+MAX_ADDRESSES: Final = 256
+"""Of nodes whose dictionary is known; the least recently added are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +96,44 @@ class DictionaryCache:
             self._write(self._folder, _file_name(cached, key), compressed)
         except OSError as error:
             self.problem = f"cannot write to {self._folder}: {error.strerror or error}"
+
+    def remember(self, address: str, dictionary: Dictionary) -> None:
+        """Record that the node at ADDRESS has DICTIONARY, if it is one of the cache."""
+        key = next((key for key, kept in self._kept.items() if kept.dictionary is dictionary), None)
+        if key is None or self._folder is None:
+            return
+        addresses = self._addresses()
+        if addresses.get(address) == key:
+            return
+        addresses.pop(address, None)
+        addresses[address] = key
+        newest = dict(list(addresses.items())[-MAX_ADDRESSES:])
+        try:
+            self._replace(self._folder, _ADDRESSES, json.dumps(newest, indent=0).encode())
+        except OSError as error:
+            self.problem = f"cannot write to {self._folder}: {error.strerror or error}"
+
+    def of_node(self, address: str) -> Dictionary | None:
+        """Return the dictionary that the node at ADDRESS had when it was last connected; None: not known."""
+        key = self._addresses().get(address)
+        if key is None:
+            return None
+        self._read_folder(b"")
+        kept = self._kept.get(key)
+        return None if kept is None else kept.dictionary
+
+    def _addresses(self) -> dict[str, str]:
+        """Return the SHA-256 of the dictionary of each address, the newest last."""
+        if self._folder is None:
+            return {}
+        content = _read(self._folder / _ADDRESSES, b"")
+        try:
+            found = json.loads(content or b"{}")
+        except ValueError:
+            return {}
+        if not isinstance(found, dict):
+            return {}
+        return {str(address): str(key) for address, key in found.items()}
 
     @contextlib.asynccontextmanager
     async def downloading(self, beginning: bytes) -> AsyncIterator[None]:
@@ -160,16 +202,20 @@ class DictionaryCache:
         return [path for _, path in sorted(found)]
 
     def _write(self, folder: Path, name: str, compressed: bytes) -> None:
+        self._replace(folder, name, compressed)
+        for path in self._oldest_first()[:-MAX_FILES]:
+            path.unlink(missing_ok=True)
+
+    @staticmethod
+    def _replace(folder: Path, name: str, content: bytes) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         # Another process may write the same: each writes a file of its own and renames it when complete.
         temporary = folder / f"{_TEMPORARY}{os.getpid()}"
         try:
-            temporary.write_bytes(compressed)
+            temporary.write_bytes(content)
             temporary.replace(folder / name)
         finally:
             temporary.unlink(missing_ok=True)
-        for path in self._oldest_first()[:-MAX_FILES]:
-            path.unlink(missing_ok=True)
 
 
 @dataclass(slots=True)

@@ -10,11 +10,17 @@ from coordinator.motion.steps._steps import lib
 def resting_step(spec: StepperSpec, start: Position, position: Position) -> int:
     """Return the steps a stepper that started at START has done when its axes rest at POSITION (mm).
 
-    Half a step rounds up, and 1/65536 of a step decides no tie.
+    POSITION must not be at a half step: there it depends on where the stepper came from.
     """
+    (step,) = resting_steps(spec, start, position)
+    return step
+
+
+def resting_steps(spec: StepperSpec, start: Position, position: Position) -> set[int]:
+    """Return where the stepper may stand: at one step, or at a half step at either side of it."""
     begin, end = (_mix(spec, at) / spec.step_distance for at in (start, position))
-    snap = int(lib.STEP_SNAP)
-    return math.floor(round((end - begin) * snap) / snap + 0.5)
+    tie = 1 / int(lib.STEP_TIE)
+    return {math.floor(end - begin + 0.5 - tie), math.floor(end - begin + 0.5 + tie)}
 
 
 def _mix(spec: StepperSpec, position: Position) -> float:

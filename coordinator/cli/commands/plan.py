@@ -43,7 +43,7 @@ def _declare(command: argparse.ArgumentParser) -> None:
         type=partial(parse_assignment, convert=existing_file),
         action=Assignments,
         metavar="NODE=FILE",
-        help="data dictionary of a node (JSON); by default, that of canductor's firmware",
+        help="data dictionary of a node (JSON); by default, the one it had when it was last connected",
     )
     add(
         "--bitrate",

@@ -76,7 +76,10 @@ MCU = SectionSpec(
 )
 BOARD_MCU = ListOption(name="mcu", help="the nodes that have these pins", default=(PRIMARY_NODE,))
 ALIASES = ListOption(name="aliases", help="NAME=PIN pairs; NAME=<WORD> reserves a pin")
-BOARD_PINS = SectionSpec(help="Second names for pins, as printed on a board", options=(BOARD_MCU, ALIASES))
+MORE_ALIASES = ListOption(name="aliases_", help="further NAME=PIN pairs, for one connector")
+BOARD_PINS = SectionSpec(
+    help="Second names for pins, as printed on a board", options=(BOARD_MCU, ALIASES), family=MORE_ALIASES
+)
 SHARED_PINS = ListOption(name="pins", help="pins that several options may use")
 DUPLICATE_PIN_OVERRIDE = SectionSpec(help="Pins that are shared on purpose", options=(SHARED_PINS,))
 

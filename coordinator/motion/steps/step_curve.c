@@ -14,9 +14,7 @@ static const double EXACT_S = 1e-10; // of a solution
 static const int ITERATIONS = 80;
 static const double CLOSE_S = 1e-8; // a change by Newton after which the next would be far below EXACT_S
 enum { NEWTONS = 4, SOLVED = 256 };
-static const double NOISE_STEPS = 1e-7; // a stepper whose place changes by less in a span stands there
-static const double STANDS_S = 0.001;   // at least, to be sure that it is no turn
-static const double LEVEL_MM = 1e-9;    // less is rounding of a Z that stays
+static const double LEVEL_MM = 1e-9; // less is rounding of a Z that stays
 
 struct piece {
     double begin, seconds;
@@ -239,7 +237,7 @@ static double bed_cut(const struct step_gen *gen, const struct stepper *s, const
 static bool stays_near(const struct step_gen *gen, const struct stepper *s, const double low[3],
                        const double high[3], double along) {
     const double *weights = s->config.weights, *known = s->known_at;
-    const double room = (0.5 - 2.0 / STEP_SNAP - fabs(s->known_off)) * s->config.step_distance;
+    const double room = (0.5 - 2.0 / STEP_TIE - fabs(s->known_off)) * s->config.step_distance;
     double far[3], straight = 0; // by the weights alone
     for (int i = 0; i < 3; i++) {
         far[i] = fmax(fabs(low[i]), fabs(high[i]));
@@ -458,35 +456,70 @@ static int play_solved(struct step_gen *gen, struct stepper *s, const struct pie
     return STEP_OK;
 }
 
+// In which the stepper does not turn: times from the piece's begin, places in steps, speeds.
+struct span {
+    double from, to, begin, end, v0, v1;
+    int direction;
+    int64_t target;
+};
+
+static int put_span(struct step_gen *gen, struct stepper *s, const struct piece *p, const struct span *of) {
+    if (!p->linear || p->smooth)
+        return play_solved(gen, s, p, of->from, of->to, of->direction, of->target);
+    struct phase span = {.time = p->begin + of->from, .seconds = of->to - of->from};
+    span.way = fabs(of->end - of->begin);
+    span.backwards = of->v1 < of->v0;
+    span.speed = fmin(of->v0, of->v1);
+    span.accel = 2 * fabs(p->poly[2]);
+    const double boundary = (double)s->position + 0.5 * of->direction;
+    return step_put(gen, s, &span, of->direction, fmax((boundary - of->begin) * of->direction, 0), 1,
+                    (of->target - s->position) * of->direction);
+}
+
+// The step over a boundary that the stepper passed before this span, by less than decides a tie.
+static int put_undecided(struct step_gen *gen, struct stepper *s, const struct piece *p, double from,
+                         double begin, int direction) {
+    if ((begin - (double)s->position) * direction <= 0.5)
+        return STEP_OK;
+    const bool known = s->crossed_direction == direction;
+    double t[FILL_BLOCK] = {known ? s->crossed - p->begin : from};
+    const struct phase flow = {.time = p->begin, .seconds = p->seconds, .solved = t};
+    return step_put(gen, s, &flow, direction, 0, 1, 1);
+}
+
+// Where the span ends a little beyond a boundary: the next decides whether that is a step, and it is due when
+// the boundary was passed, or when the stepper goes on if it rests or turns there.
+static void note_tie(const struct step_gen *gen, struct stepper *s, const struct piece *p, double from,
+                     double to, double begin, double end) {
+    const int direction = end > begin ? 1 : -1;
+    const double boundary = (double)s->position + 0.5 * direction;
+    const bool beyond = end != begin && (end - boundary) * direction > 0;
+    if (beyond && (begin - boundary) * direction <= 0) {
+        s->crossed = p->begin + solve(gen, s, p, from, to, from, direction, boundary);
+        s->crossed_direction = direction;
+    } else if (!beyond || s->crossed_direction != direction) {
+        s->crossed_direction = 0;
+    }
+}
+
 static int play_span(struct step_gen *gen, struct stepper *s, const struct piece *p,
                      const struct moment *first, const struct moment *last) {
     const double from = first->t, to = last->t, v0 = first->speed, v1 = last->speed;
     const double begin = first->at, end = last->at;
     if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
         return step_fail(gen, STEP_BAD_MOVE, s, p->begin, end);
-    const bool stands = p->still || fabs(end - begin) < NOISE_STEPS;
-    if (stands && !p->still && to - from < STANDS_S)
-        return STEP_OK;
-    // Only where the stepper stands does rounding decide: on the way, and at a turn, a boundary is crossed or
-    // not.
-    const int64_t target = stands ? step_nearest(end) : (int64_t)floor(end + 0.5);
-    const int direction = stands ? (target > s->position ? 1 : -1) : end > begin ? 1 : -1;
-    const int64_t count = (target - s->position) * direction;
-    if (count <= 0)
-        return STEP_OK;
-    if (!p->linear || p->smooth)
-        return play_solved(gen, s, p, from, to, direction, target);
-    struct phase span = {.time = p->begin + from, .seconds = to - from, .way = fabs(end - begin)};
-    span.backwards = fabs(v1) < fabs(v0);
-    span.speed = fmin(fabs(v0), fabs(v1));
-    span.accel = 2 * fabs(p->poly[2]);
-    if (span.way < 1e-4) { // no more than what snaps
-        span.backwards = false;
-        span.accel = 0;
-        span.speed = (double)(count + 1) / span.seconds;
+    const int64_t target = step_settle(end, s->position);
+    int status = STEP_OK;
+    if (target != s->position) {
+        const int direction = target > s->position ? 1 : -1;
+        status = put_undecided(gen, s, p, from, begin, direction);
+        if (!status && target != s->position)
+            status = put_span(gen, s, p,
+                              &(struct span){from, to, begin, end, fabs(v0), fabs(v1), direction, target});
     }
-    const double boundary = (double)s->position + 0.5 * direction;
-    return step_put(gen, s, &span, direction, (boundary - begin) * direction, 1, count);
+    if (!status)
+        note_tie(gen, s, p, from, to, begin, end);
+    return status;
 }
 
 static int play_piece(struct step_gen *gen, struct stepper *s, const struct piece *p) {
@@ -522,6 +555,7 @@ static int play_piece(struct step_gen *gen, struct stepper *s, const struct piec
 }
 
 int step_curve_advance(struct step_gen *gen, struct stepper *s, double until) {
+    s->crossed = fmax(s->crossed, s->time); // what is due before may be compressed
     while (s->time < until - ROUNDING_S) {
         if (s->follows_bed)
             pass_moves(gen, s, until);

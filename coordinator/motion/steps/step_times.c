@@ -14,8 +14,13 @@ static double mix(const double *weights, const double *values) {
     return weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2] + weights[3] * values[3];
 }
 
-int64_t step_nearest(double u) {
-    return (int64_t)floor(nearbyint(u * STEP_SNAP) / STEP_SNAP + 0.5);
+int64_t step_settle(double u, int64_t position) {
+    const double tie = 1.0 / STEP_TIE;
+    const int64_t up = (int64_t)floor(u + 0.5 - tie);
+    if (up > position)
+        return up;
+    const int64_t down = (int64_t)ceil(u - 0.5 + tie);
+    return down < position ? down : position;
 }
 
 static void split(const struct trapezoid *m, struct phase phase[3]) {
@@ -175,7 +180,7 @@ static int play(struct step_gen *gen, struct stepper *s, const struct trapezoid 
     if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
         return step_fail(gen, STEP_BAD_MOVE, s, m->print_time, end);
     const int direction = ratio > 0 ? 1 : -1;
-    const int64_t target = step_nearest(end);
+    const int64_t target = step_settle(end, s->position);
     int last = 2;
     while (last > 0 && !(phase[last].way > 0))
         last--;
@@ -195,8 +200,9 @@ static int play(struct step_gen *gen, struct stepper *s, const struct trapezoid 
         if (count <= 0)
             continue;
         const double boundary = (double)s->position + 0.5 * direction;
-        const int status =
-            step_put(gen, s, p, direction, (boundary - begin) / ratio - p->from, 1 / fabs(ratio), count);
+        // A tie's width behind, it was passed by the move before.
+        const double x = fmax((boundary - begin) / ratio - p->from, 0);
+        const int status = step_put(gen, s, p, direction, x, 1 / fabs(ratio), count);
         if (status)
             return status;
     }

@@ -3,13 +3,14 @@
 //
 //   trapezoids ──► step times (closed form) ──► (interval, count, add) segments ──► merged per node ──► batch
 //
-// Where a stepper stands. With u = sum(weights·position)/step_distance − origin, a stepper whose axes rest at
-// u has done n = floor(snap(u) + ½) steps; snap rounds to 1/STEP_SNAP of a step, so that the noise of
-// floating point cannot decide a tie: a half goes up. A stepper that stands while its axes move (u changes by
-// less than 1e-7 steps for more than 1 ms) rests, too, and moves of unshaped linear steppers end snapped.
-// Elsewhere, also at a turn, nothing snaps: a step is due when u crosses k + ½. Two opposite steps closer
-// than the stepper's pulses allow (a turn just behind a boundary) cancel out: neither is done. If the first
-// of them is already on its way (flushed), the second is put off until the pulses allow it.
+// Where a stepper stands. Let u = sum(weights·position)/step_distance − origin. A stepper at n goes on to
+// n + 1 when u crosses the boundary n + ½, if u then gets more than 1/STEP_TIE of a step beyond it before it
+// comes back; downwards likewise at n − ½. So a rest or a turn at a half step (a tie) is decided once, by
+// where the stepper came from, and neither the noise of floating point nor a rest makes a pair of opposite
+// steps there. Where u rests within 1/STEP_TIE beyond a boundary and then goes on, the step is due when it
+// goes on. Two opposite steps closer than the stepper's pulses allow (a turn just behind a boundary) cancel
+// out: neither is done. If the first of them is already on its way (flushed), the second is put off until
+// the pulses allow it.
 //
 // Segments. Step i (from 1) of a segment happens interval·i + add·i(i−1)/2 ticks after the last step before
 // it, and not further from its true time than max_error and half the distance to either neighbour.
@@ -34,7 +35,7 @@ enum {
     STEP_SEGMENTS = 8192,   // segments of one stepper that wait to be merged
     STEP_OUT_BYTES = 1 << 18,
     STEP_MOVE_COUNT_MAX = 65535,
-    STEP_SNAP = 65536,
+    STEP_TIE = 1 << 20, // a tie is decided by more than 1/STEP_TIE of a step
     STEP_PARAMS = 8,
     STEP_IMPULSES = 8,         // of one axis' shaper
     STEP_TABLE_POINTS = 1024,  // of one axis' table

@@ -198,8 +198,8 @@ class HomingMove:
             node = self._machine.nodes[devices.endstop_node(rail)]
             if await self._is_pressed(rail, node):
                 raise AlreadyPressedError(
-                    f"the endstop of axis {rail.axis} is pressed before the move towards it; move the axis "
-                    "away by hand, or check the endstop's wiring and whether its pin has to be inverted"
+                    f"the endstop of axis {rail.axis} is pressed before the move towards it; "
+                    f"{_pressed_cure(rail)}"
                 )
         began_at = await self._machine.query_stepper_counts()
         move = SingleMove(self._machine, self._ramp, self._ratio, ways=self._ways, lead_s=lead_s)
@@ -362,7 +362,7 @@ class HomingMove:
         if not _switched(leg, states):
             raise EndstopNotFoundError(
                 f"axis {leg.name} moved {self._ramp.way_mm:g} mm and its endstop did not switch; "
-                "check the endstop's wiring, the direction of the axis, and homing_positive_dir",
+                f"{_not_found_cure(leg.rail)}",
                 self._ramp.way_mm,
             )
 
@@ -395,6 +395,26 @@ class HomingMove:
         heard_s = move.print_time_now() if leg.triggered_s is None else leg.triggered_s
         near = Ticks(move.ticks_at(name, heard_s))
         return move.print_time_of(name, extend32(state.next_clock32, near) - leg.rest_ticks)
+
+
+def _pressed_cure(rail: RailDescription) -> str:
+    if not rail.homing.is_sensorless:
+        return (
+            "move the axis away by hand, or check the endstop's wiring and whether its pin has to be inverted"
+        )
+    return (
+        "the motor still reports a stall, most likely because the axis stands at its end while another one"
+        " moves along it: let one axis leave its end first (docs/tmc.md, Homing without switches)"
+    )
+
+
+def _not_found_cure(rail: RailDescription) -> str:
+    if not rail.homing.is_sensorless:
+        return "check the endstop's wiring, the direction of the axis, and homing_positive_dir"
+    return (
+        "raise the driver's sensitivity (driver_SGTHRS), check diag_pin, the direction of the axis, and"
+        " homing_positive_dir (docs/tmc.md, Homing without switches)"
+    )
 
 
 def _way(leg: _Leg, move: SingleMove, steps: dict[str, int]) -> float:

@@ -5,14 +5,17 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.assembly.compared import BEGIN, name_tables, verdict_table, with_firmware_column
 from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.gcode.builtins import basic as basic_commands
 from coordinator.gcode.builtins import machine as machine_commands
 from coordinator.modules.registry import own_kinds
+from tests.profiles import is_full
 
 ROOT = Path(__file__).parents[3]
-PAGE = (ROOT / "docs" / "compared.md").read_text(encoding="utf-8")
-ROW = re.compile(r"^\| `(\[?)(\w+)\]?` \| (\w+) \| [^|]* \| ?([^| ]*) ?\|$", re.MULTILINE)
+WHOLE_PAGE = (ROOT / "docs" / "compared.md").read_text(encoding="utf-8")
+PAGE = WHOLE_PAGE.partition(BEGIN)[0]
+ROW = re.compile(r"^\| `(\[?)(\w+)\]?` \| (\w+) \| [^|]* \| ?([^| ]*) ?\| (?:yes)? ?\|$", re.MULTILINE)
 ROWS: list[tuple[str, str, str, str]] = ROW.findall(PAGE)
 HERE = {name: here for _, name, here, _ in ROWS}
 REFERENCE = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
@@ -60,3 +63,37 @@ def test_the_interpreters_own_commands_are_here() -> None:
     waiting = {"G5"}  # refused with a sentence
     known = {*basic_commands.HANDLERS, *machine_commands.HANDLERS} - waiting
     assert sorted(known - HERE.keys()) == []
+
+
+DATA = ROOT / ".." / "shared" / "data"
+FIRMWARE_TESTS = (
+    "tests/smoke/test_foreign_firmware.py",
+    "tests/stages/foreign_firmware.py",
+    "../shared/data/firmware/klipper-linux.cfg",
+)
+COMMAND = (
+    f"python -m coordinator.assembly.compared ../shared/data docs/compared.md {' '.join(FIRMWARE_TESTS)}"
+)
+
+
+@pytest.mark.skipif(not (DATA / "firmware").exists(), reason="the peer's firmware is no part of the project")
+def test_the_last_column_marks_what_ran_with_the_peers_firmware() -> None:
+    tests = "\n".join((ROOT / name).read_text(encoding="utf-8") for name in FIRMWARE_TESTS)
+    assert with_firmware_column(PAGE, tests) == PAGE, f"run {COMMAND}"
+    assert sum(line.endswith("| yes |") for line in PAGE.splitlines()) > 5
+
+
+@pytest.mark.skipif(
+    not (DATA / "peer").exists(), reason="the peer's reference as data is no part of the project"
+)
+def test_the_tables_of_names_are_those_of_now() -> None:
+    macros = (ROOT / "docs" / "gcode.md").read_text(encoding="utf-8")
+    tables = name_tables(DATA / "peer", PAGE, macros)
+    assert tables in WHOLE_PAGE, f"run {COMMAND}"
+
+
+@pytest.mark.skipif(not is_full(), reason="loads 160 machines; test_real_configs.py loads each in profile ci")
+def test_the_table_of_configurations_is_that_of_now() -> None:
+    if not (DATA / "config" / "real").exists():
+        pytest.skip("configurations that people use are no part of the project")
+    assert verdict_table(DATA / "config" / "real") in WHOLE_PAGE

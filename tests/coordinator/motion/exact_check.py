@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.verification.exact_path import SNAP, Leg, Position, StepperPath, follow, resting, solve
+from coordinator.verification.exact_path import Leg, Position, StepperPath, follow, solve
 from coordinator.verification.exact_signal import Floats
+from coordinator.verification.half_steps import TIE_STEPS
 from tests.coordinator.motion.replay import Stream
 
 CHUNK = 1 << 18
@@ -16,8 +17,6 @@ NOISE_S = 2e-9
 """Print times of an hour have a resolution of 0.5 ns."""
 NOISE_STEPS = 1e-7
 """Rounding of a position; where a stepper stands still, its crossing has no better defined time."""
-TIE_STEPS = 0.5 / SNAP
-"""A stepper that comes to rest so close below a boundary is taken to have reached it."""
 Epoch = tuple[Position, NDArray[np.void]]
 """Where the axes are declared to stand, and the trapezoids from there on."""
 
@@ -50,16 +49,15 @@ class StepperProof:
         self.name = legs[0].spec.name
         self.paths: list[StepperPath] = []
         self._begins: list[float] = []
-        end, rest = -math.inf, 0.0
-        self.wanted = 0
-        for leg, (path, _, u, place) in zip(legs, follow(legs), strict=True):
+        end = -math.inf
+        self.wanted = self.wanted_position = 0
+        for leg, (path, _, _, place) in zip(legs, follow(legs), strict=True):
             begin, last = float(leg.moves[0]["print_time"]), leg.moves[-1]
             self._begins.append((begin + end) / 2 if self.paths else -math.inf)
             end = float(last["print_time"] + last["accel_s"] + last["cruise_s"] + last["decel_s"])
             self.paths.append(path)
             self.wanted += int(np.abs(np.diff(place)).sum())
-            rest = float(u[-1])
-        self.wanted_position = resting(rest)
+            self.wanted_position = int(place[-1])
 
     def true_times(
         self, boundary: Floats, direction: NDArray[np.int64], near: Floats, reach_s: float

@@ -14,7 +14,7 @@ from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 Position = tuple[float, float, float, float]
 LONG = np.longdouble
 Longs = np.ndarray[tuple[int], np.dtype[np.longdouble]]
-SNAP = 65536
+TIE_STEPS = 1 / 1048576
 SLACK_TICKS = 2
 BISECTIONS = 70
 """A move of 1,000 s is then known to 1e-18 s: below the resolution of a long double, which has 64 bits."""
@@ -87,8 +87,13 @@ def _mix(spec: StepperSpec, at: Sequence[float]) -> float:
     return float(sum(w * a for w, a in zip(spec.weights, at, strict=True)))
 
 
-def _position(u: float) -> int:
-    return math.floor(round(u * SNAP) / SNAP + 0.5)
+def _position(u: float, position: int) -> int:
+    nearest = math.floor(u + 0.5)
+    past = abs(u - position) - 0.5
+    between = abs(u - math.floor(u) - 0.5) <= TIE_STEPS
+    if past <= TIE_STEPS:
+        return position
+    return (math.floor(u) if u > position else math.floor(u) + 1) if between else nearest
 
 
 def step_times(
@@ -100,7 +105,7 @@ def step_times(
     steps: list[Step] = []
     position = 0
     for move in moves:
-        target = _position(_mix(spec, move.end) / spec.step_distance - origin)
+        target = _position(_mix(spec, move.end) / spec.step_distance - origin, position)
         ratio = LONG(_mix(spec, move.ratio)) / LONG(spec.step_distance)
         direction = 1 if ratio > 0 else -1
         if ratio == 0 or (target - position) * direction <= 0:

@@ -68,10 +68,10 @@ def test_generating_in_pieces_changes_no_step(moves: list[Move], shares: list[tu
     run.check(moves, flushed=True)
 
 
-def back_and_forth(turn: float, *, rest_s: float = 0.0) -> list[Move]:
-    first = make_move(1.0, ORIGIN, (turn, 0.0, 0.0, 0.0), (0.0, 50.0, 0.0), 1000.0)
+def back_and_forth(turn: float, *, rest_s: float = 0.0, accel: float = 1000.0) -> list[Move]:
+    first = make_move(1.0, ORIGIN, (turn, 0.0, 0.0, 0.0), (0.0, 50.0, 0.0), accel)
     t = 1.0 + first.total_s + rest_s
-    second = make_move(t, (turn, 0.0, 0.0, 0.0), ORIGIN, (0.0, 50.0, 0.0), 1000.0)
+    second = make_move(t, (turn, 0.0, 0.0, 0.0), ORIGIN, (0.0, 50.0, 0.0), accel)
     return [first, second]
 
 
@@ -86,8 +86,8 @@ def test_turning_exactly_on_a_boundary_makes_no_pair_of_steps(steps: float) -> N
         assert len(run.steps(0)) == 2 * abs(int(turn - rounding))
 
 
-def test_resting_exactly_on_a_boundary_rounds_up() -> None:
-    for turn, there in ((10.5, 11), (-10.5, -10)):
+def test_a_rest_at_a_half_step_stays_where_it_came_from() -> None:
+    for turn, there in ((10.5, 10), (-10.5, -10), (10.5 + 5e-7, 10), (10.5 + 2e-6, 11), (10.5 - 2e-6, 10)):
         moves = back_and_forth(turn * 0.00625, rest_s=1.0)
         run = Run([stepper(0, X)], [node_spec()])
         run.play(moves)
@@ -98,7 +98,7 @@ def test_resting_exactly_on_a_boundary_rounds_up() -> None:
 
 
 def test_a_flush_between_two_opposite_steps_puts_the_second_off() -> None:
-    moves = back_and_forth(10.5 * 0.00625)
+    moves = back_and_forth((10.5 + 2e-6) * 0.00625, accel=1e5)
     run = Run([stepper(0, X)], [node_spec()])
     run.play(moves, [(moves[1].print_time, True)])
     clocks = [clock for clock, _ in run.steps(0)]
