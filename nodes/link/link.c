@@ -16,10 +16,10 @@
 #define EARLY_SHARE 16
 #define ANSWER_MIN_NS (4 * NS_PER_MS)
 #define DOUBLE_NS (200 * NS_PER_MS) // commands that are due so soon are repeated twice at a time
-#define TRIES 10                    // timeouts, at least, before a link counts as lost
-#define NAK_DOUBLINGS_MAX 2         // of the wait after a nak: the node answers
-#define FRAME_BYTES 8               // of CAN; a serial line has no frames, the gaps do no harm there
-#define FILLER 0                    // no block begins with it
+#define TRIES 8             // timeouts, at least, before a link counts as lost; of 1 s, longer than GAP_NS
+#define NAK_DOUBLINGS_MAX 2 // of the wait after a nak: the node answers
+#define FRAME_BYTES 8       // of CAN; a serial line has no frames, the gaps do no harm there
+#define FILLER 0            // no block begins with it
 
 // -------------------------------------------------------------------------------------------------- set-up
 
@@ -188,7 +188,7 @@ static size_t gap_before_copy(size_t size) {
 // Appends a copy of BLOCK to the SIZE bytes at OUT, if both fit into the window; returns the size then.
 static size_t append_copy(struct link *link, const struct link_block *block, uint8_t *out, size_t size) {
     size_t gap = gap_before_copy(size), twice = size + gap + block->length;
-    if (!link_fits(link, twice))
+    if (twice > link->settings.receive_window) // nothing else is in flight
         return size;
     memset(out + size, WIRE_SYNC, gap);
     memcpy(out + size + gap, block->bytes, block->length);
@@ -218,7 +218,8 @@ size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_
     if (!size)
         return 0;
     if (block->sent_ns) {
-        block->repeats += block->repeats < UINT8_MAX;
+        if (block->repeats < UINT8_MAX)
+            block->repeats++;
         link->stats.blocks_repeated++;
         link->stats.bytes_repeated += size;
     }
@@ -358,7 +359,7 @@ void link_handle_timer(struct link *link, uint64_t now) {
     }
 }
 
-uint64_t link_deadline(const struct link *link, uint64_t now, unsigned allowed) {
+static uint64_t next_deadline(const struct link *link, uint64_t now, unsigned allowed) {
     if (link->state == LINK_LOST)
         return LINK_NEVER;
     uint64_t at_ns = lost_deadline(link);
@@ -369,6 +370,12 @@ uint64_t link_deadline(const struct link *link, uint64_t now, unsigned allowed) 
         return at_ns;
     uint64_t gate_ns = link_plan_block(link, now, allowed).at_ns;
     return gate_ns > now && gate_ns < at_ns ? gate_ns : at_ns;
+}
+
+// A command that is due soon may make it time for a repeat: the owner has just called link_handle_timer().
+uint64_t link_deadline(const struct link *link, uint64_t now, unsigned allowed) {
+    uint64_t at_ns = next_deadline(link, now, allowed);
+    return at_ns > now ? at_ns : now + 1;
 }
 
 void link_get_stats(const struct link *link, struct link_stats *out) {

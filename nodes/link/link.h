@@ -198,7 +198,7 @@ int link_next_offer(const struct link *link, uint64_t now, unsigned allowed, str
 size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_t *out);
 
 // Returns when link_handle_timer, link_receive or link_next_block with ALLOWED next has something to do.
-// UINT64_MAX: not without an event.
+// Later than NOW; UINT64_MAX: not without an event.
 uint64_t link_deadline(const struct link *link, uint64_t now, unsigned allowed);
 
 // Returns since when the oldest transmission has waited for its acknowledgement; UINT64_MAX: none does.

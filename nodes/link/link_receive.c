@@ -162,6 +162,31 @@ static void handle_block(struct link *link, const uint8_t *bytes, size_t length,
     response->received_ns = now;
 }
 
+// Drops the front of the buffer up to and including the next sync byte.
+static void give_up_partial(struct link *link) {
+    const uint8_t *sync = memchr(link->rx, WIRE_SYNC, link->rx_used);
+    size_t drop = sync ? (size_t)(sync - link->rx) + 1 : link->rx_used;
+    link->stats.bytes_invalid += drop;
+    link->rx_used -= drop;
+    memmove(link->rx, link->rx + drop, link->rx_used);
+}
+
+// Returns whether an empty block stands behind a sync byte in the incomplete one. Then the length of that one
+// is wrong. Without this, the answers to repeats, which follow each other within GAP_NS, would be taken for a
+// part of it.
+static int holds_answer(const struct link *link) {
+    for (size_t at = WIRE_HEADER; at + WIRE_BLOCK_MIN < link->rx_used; at++) {
+        const uint8_t *bytes = link->rx + at + 1;
+        uint8_t answer[WIRE_BLOCK_MIN];
+        if (link->rx[at] != WIRE_SYNC || bytes[0] != WIRE_BLOCK_MIN || bytes[1] >> 4 != WIRE_SEQ_MARK >> 4)
+            continue;
+        wire_block_finish(answer, 0, bytes[1] & WIRE_SEQ_MASK);
+        if (memcmp(bytes, answer, WIRE_BLOCK_MIN) == 0)
+            return 1;
+    }
+    return 0;
+}
+
 // Takes one step through the receive buffer; returns 0 when it needs more bytes.
 static int scan_once(struct link *link, uint64_t now, struct link_response *response) {
     size_t skip, length;
@@ -173,16 +198,10 @@ static int scan_once(struct link *link, uint64_t now, struct link_response *resp
         handle_block(link, link->rx + skip, length, now, response);
     link->rx_used -= skip + length;
     memmove(link->rx, link->rx + skip + length, link->rx_used);
-    return found != WIRE_MORE;
-}
-
-// Drops the front of the buffer up to and including the next sync byte.
-static void give_up_partial(struct link *link) {
-    const uint8_t *sync = memchr(link->rx, WIRE_SYNC, link->rx_used);
-    size_t drop = sync ? (size_t)(sync - link->rx) + 1 : link->rx_used;
-    link->stats.bytes_invalid += drop;
-    link->rx_used -= drop;
-    memmove(link->rx, link->rx + drop, link->rx_used);
+    if (found != WIRE_MORE || !holds_answer(link))
+        return found != WIRE_MORE;
+    give_up_partial(link);
+    return 1;
 }
 
 uint64_t link_partial_deadline(const struct link *link) {

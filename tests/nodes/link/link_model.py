@@ -176,7 +176,7 @@ class LinkModel:
 
     @property
     def rto_ns(self) -> int:
-        return min(self.first_rto_ns << self.backoff, self.lost_after_ns // 10)
+        return min(self.first_rto_ns << self.backoff, self.lost_after_ns // 8)
 
     @property
     def unanswered_since(self) -> int:
@@ -231,6 +231,9 @@ class LinkModel:
             self._rewind(now, "flush")
 
     def deadline(self, now: int, allowed: int) -> int:
+        return max(self._next_deadline(now, allowed), now + 1)
+
+    def _next_deadline(self, now: int, allowed: int) -> int:
         if self.state == "lost":
             return NEVER
         at_ns = min(self.lost_at, self._repeat_at, self._partial_at)
@@ -399,7 +402,7 @@ class LinkModel:
         if not self._fits(len(data)):
             return b""
         double = data + bytes([SYNC]) * (-len(data) % 8 + 1) + sent.data
-        if twice and self._fits(len(double)):
+        if twice and len(double) <= self.window:
             self.naks_outstanding += 1
             return double
         return data
@@ -478,7 +481,10 @@ class LinkModel:
             length = self.rx[0]
             sound = EMPTY <= length <= WHOLE and (len(self.rx) < 2 or self.rx[1] >> 4 == 1)
             if sound and len(self.rx) < length:
-                return found
+                if not any(bytes([SYNC]) + block(seq) in self.rx for seq in range(16)):
+                    return found
+                self.count["bytes_invalid"] += self._hunt()
+                continue
             whole = self.rx[:length]
             if sound and whole[-3:] == crc16(whole[:-3]).to_bytes(2, "big") + bytes([SYNC]):
                 self.rx = self.rx[length:]
