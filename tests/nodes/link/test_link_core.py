@@ -320,7 +320,9 @@ def test_silence_loses_the_link_once_and_in_time(lost_after_ns: int) -> None:
 
 def test_a_node_that_answers_but_accepts_nothing_is_told_apart() -> None:
     line = connected()
-    line.fault = lambda way, index, data: [(0, data.replace(store(1), b"xxx"))] if way == TO_NODE else [(0, data)]
+    line.fault = lambda way, index, data: (
+        [(0, data.replace(store(1), b"xxx"))] if way == TO_NODE else [(0, data)]
+    )
     line.link.send(store(1))
     while not line.link.lost:
         assert line.step()
