@@ -311,7 +311,8 @@ def _faults(entries: object, where: str) -> tuple[FaultSetting, ...]:
         on_bus = fault.kind in ("loss", "corruption", "errors")
         if not _is_content(fault.data):
             raise ScenarioError(
-                f"{where}: [[faults]] number {number_}: data {shown(fault.data)} is not 0..8 bytes in hexadecimal"
+                f"{where}: [[faults]] number {number_}: data must be 0..8 bytes in hexadecimal, "
+                f"not {shown(fault.data)}"
             )
         missing = "bus" if on_bus and not fault.bus else "node" if _needs_node(fault) else ""
         if missing:
