@@ -6,7 +6,7 @@ AREA ?=
 MINUTES ?= 15
 STEPS ?=
 
-.PHONY: thorough sim mutants mutation soak arm
+.PHONY: thorough sim loss mutants mutation soak arm
 
 thorough: setup
 	$(BIN)/python -m tests.thorough.run --seeds $(SIM_SEEDS) --seed $(SEED) --sample $(SAMPLE) \
@@ -15,6 +15,11 @@ thorough: setup
 # Whole machines in virtual time, each seed with other faults (docs/simulation.md).
 sim: setup
 	$(BIN)/canductor simulate --seeds 0:$(SIM_SEEDS)
+
+# 300 prints on a bus that loses 5 % of the frames, 100 on one that loses 10 %: all complete.
+loss: setup
+	$(BIN)/canductor simulate loss_5_percent --seeds 0:300
+	$(BIN)/canductor simulate loss_10_percent --seeds 0:100
 
 # Do the simulation and the tests find anything? Plants bugs and looks (tests/sim/mutants.toml).
 mutants: setup

@@ -49,6 +49,7 @@ class SimActor:
             "power": self._power,
             "stall": self._stall,
             "babble": self._babble,
+            "forge": self._forge,
             "loss": self._rate,
             "corruption": self._rate,
             "errors": self._disturb,
@@ -108,10 +109,18 @@ class SimActor:
         else:
             self._board(fault).stall(duration_s)
 
-    def _babble(self, fault: ScenarioFault, begins: bool) -> None:
+    def _controller(self, fault: ScenarioFault) -> CanController:
         controller = self._board(fault).node.controller
         if controller is None:
-            raise ScenarioError(f"{self._name}: the node '{fault.node}' is on a UART and cannot babble")
+            raise ScenarioError(f"{self._name}: the node '{fault.node}' is on a UART and cannot {fault.kind}")
+        return controller
+
+    def _forge(self, fault: ScenarioFault, begins: bool) -> None:
+        if begins:
+            self._controller(fault).send(fault.can_id, fault.data)
+
+    def _babble(self, fault: ScenarioFault, begins: bool) -> None:
+        controller = self._controller(fault)
         if begins:
             controller.babble(fault.can_id, BABBLE, (fault.end_ns - fault.begin_ns) / NS)
 

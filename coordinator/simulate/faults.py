@@ -25,6 +25,7 @@ class ScenarioFault:
     end_ns: int
     share: float
     can_id: int
+    data: bytes = b""
 
 
 class Actor(Protocol):
@@ -78,7 +79,8 @@ class Faults:
             begin_ns = now_ns + round((begin_s + n * every_s) * NS)
             end_ns = begin_ns + duration_ns
             node, bus = setting.node, setting.bus
-            faults.append(ScenarioFault(setting.kind, node, bus, begin_ns, end_ns, draw("share"), setting.id))
+            share, data = draw("share"), bytes.fromhex(setting.data)
+            faults.append(ScenarioFault(setting.kind, node, bus, begin_ns, end_ns, share, setting.id, data))
         return faults
 
     # ------------------------------------------------------------------------------------------ afterwards

@@ -2,6 +2,7 @@
 """Scenarios: what is simulated, what goes wrong in it, and what has to come of it. docs/simulation.md."""
 
 import difflib
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -102,6 +103,7 @@ FAULT_KINDS: Final = {
     "power": "the node has no power, and starts again after it",
     "stall": "the node, or the host, does nothing",
     "babble": "the node sends frames without end",
+    "forge": "the node's controller sends one frame with the id and the content of others",
     "loss": "a share of the bus's frames vanishes",
     "corruption": "a share of the bus's frames changes without anybody noticing",
     "errors": "a share of the bus's frames becomes error frames; all of them: who sends goes bus-off",
@@ -130,7 +132,9 @@ class FaultSetting:
     share: Range = option(span(0, 1), Range(0, 0))
     """How much of the bus's frames; afterwards there are no such faults on it, whatever its setting says."""
     id: int = option(whole(0, 0x7FF), 0x700)
-    """``babble``: the CAN id that is sent."""
+    """``babble``, ``forge``: the CAN id that is sent."""
+    data: str = option(text, "")
+    """``forge``: the frame's content, at most 8 bytes as hexadecimal digits."""
     times: Range = option(span(1, 50), Range(1, 1))
     """How often it happens."""
     every_s: Range = option(span(0.01, 60, "s"), Range(1, 1))
@@ -305,14 +309,23 @@ def _faults(entries: object, where: str) -> tuple[FaultSetting, ...]:
     faults = [read(FaultSetting, e, f"{where}: [[faults]] number {i}") for i, e in enumerate(entries, 1)]
     for number_, fault in enumerate(faults, 1):
         on_bus = fault.kind in ("loss", "corruption", "errors")
+        if not _is_content(fault.data):
+            raise ScenarioError(
+                f"{where}: [[faults]] number {number_}: data must be 0..8 bytes in hexadecimal, "
+                f"not {shown(fault.data)}"
+            )
         missing = "bus" if on_bus and not fault.bus else "node" if _needs_node(fault) else ""
         if missing:
             raise ScenarioError(f"{where}: [[faults]] number {number_}: kind {fault.kind} needs a {missing}")
     return tuple(faults)
 
 
+def _is_content(text_: str) -> bool:
+    return re.fullmatch(r"([0-9a-f]{2}){0,8}", text_) is not None
+
+
 def _needs_node(fault: FaultSetting) -> bool:
-    return not fault.node and fault.kind in ("cut", "reset", "power", "stall", "babble", "sensor")
+    return not fault.node and fault.kind in ("cut", "reset", "power", "stall", "babble", "forge", "sensor")
 
 
 # ---------------------------------------------------------------------------------------------- finding

@@ -184,7 +184,7 @@ class CanBus(BusBase):
         """Record that a node stopped the bus: later reports of the other nodes are consequences."""
         for uuid, node in self._by_uuid.items():
             if self._nodeids[uuid] == nodeid:
-                node.shut_down_for(reason)
+                node.stopped_the_bus(reason)
 
     def _went_bus_off(self) -> None:
         cause = (

@@ -21,7 +21,7 @@ enum {
     LINK_BLOCKS_MAX = 15,   // in flight: the 4-bit sequence cannot distinguish 16 from none
     LINK_SLOTS = 16,        // remembered blocks, by the low four bits of their sequence
     LINK_WINDOW_MIN = 64,   // smallest receive window: one complete block
-    LINK_WIRE_MAX = 128,    // most bytes link_next_block writes: sync bytes and one block
+    LINK_WIRE_MAX = 144,    // most bytes link_next_block writes: a block twice, with sync bytes before each
     LINK_RX_MAX = 256,      // received bytes that wait for the rest of their block
     LINK_LEAD_BUCKETS = 16, // late, < 1 ms, < 2 ms, < 4 ms, … >= 2^13 ms
 };
@@ -91,12 +91,13 @@ struct link_stats {
 // A block that was sent; valid until its slot is used again.
 struct link_block {
     uint64_t sent_ns;    // last transmission
-    uint8_t repeated;    // sent more than once: its round trip is ambiguous (Karn)
+    uint8_t repeats;     // transmissions after the first, 255 at most: its round trip is ambiguous (Karn)
     uint8_t length;      // of the block
     uint8_t wire_length; // of the last transmission: with the preceding sync bytes
     uint8_t commands;
-    uint8_t kind;  // enum link_class of its first command
-    uint8_t leads; // number of req_clocks
+    uint8_t kind;       // enum link_class of its first command
+    uint8_t leads;      // number of req_clocks
+    uint64_t due_clock; // the earliest req_clock of its commands of all classes; 0: none has one
     uint64_t req_clock[WIRE_CONTENT_MAX];
     uint8_t bytes[WIRE_BLOCK_MAX];
 };
@@ -118,6 +119,7 @@ struct link {
     uint64_t last_ack;            // sequence of the last empty block
     uint64_t naks_outstanding, outstanding_until_ns,
         outstanding_until_seq; // naks that the last repeats may still cause
+    uint64_t ignored_nak_ns;   // the last of these since the last rewind and progress; 0: none
     uint64_t backoff;          // doublings of the timeout
     uint8_t lead_in;           // sync bytes before the next transmission: 0, 1, or LINK_FLUSH
     double clock_hz;           // 0: unknown
@@ -196,7 +198,7 @@ int link_next_offer(const struct link *link, uint64_t now, unsigned allowed, str
 size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_t *out);
 
 // Returns when link_handle_timer, link_receive or link_next_block with ALLOWED next has something to do.
-// UINT64_MAX: not without an event.
+// Later than NOW; UINT64_MAX: not without an event.
 uint64_t link_deadline(const struct link *link, uint64_t now, unsigned allowed);
 
 // Returns since when the oldest transmission has waited for its acknowledgement; UINT64_MAX: none does.

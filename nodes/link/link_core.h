@@ -31,6 +31,13 @@ uint64_t link_clock_to_ns(const struct link *link, uint64_t ticks);
 // Starts to transmit everything from the first unacknowledged block on again.
 void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in);
 
+// Returns the host time at which the earliest command is due that is not acknowledged or waits at the front
+// of the motion queue; 0: none is due, or the clock is unknown.
+uint64_t link_due(const struct link *link);
+
+// Returns how long an answer may take, without the reserve of link_first_rto() for a busy host.
+uint64_t link_answer_time(const struct link *link);
+
 // The timeout without doublings.
 uint64_t link_first_rto(const struct link *link);
 

@@ -179,6 +179,8 @@ void link_take(struct link *link, enum link_class kind, const struct link_front 
         link_queue_payload(queue, queue->head, &command, block->bytes + WIRE_HEADER + block->length);
         block->length = (uint8_t)(block->length + command.size);
         block->commands++;
+        if (command.req_clock && (!block->due_clock || command.req_clock < block->due_clock))
+            block->due_clock = command.req_clock;
         if (kind == LINK_MOTION) {
             link->motion_content += command.size;
             if (command.req_clock)

@@ -11,6 +11,7 @@
 #define GAP_NS (100 * NS_PER_MS)
 // A check that is so late means that this computer stood still, as the sender may have: wait once more.
 #define LATE_NS (10 * NS_PER_MS)
+#define OUTLIER_NS (10 * NS_PER_MS)
 
 // ----------------------------------------------------------------------------------------- acknowledgement
 
@@ -27,12 +28,28 @@ static void note_lead(struct link *link, uint64_t req_clock, uint64_t now) {
     stats->lead_histogram[bucket]++;
 }
 
+// Returns the greatest difference from the mean that one sample counts with. An acknowledgement that got lost
+// is replaced by the node's next answer, perhaps much later, and the time of that is no round trip.
+static uint64_t most_above(const struct link_stats *stats) {
+    return stats->srtt_ns > OUTLIER_NS ? stats->srtt_ns : OUTLIER_NS;
+}
+
 static void measure_round_trip(struct link *link, const struct link_block *block, uint64_t now) {
-    if (block->repeated)
-        return;
     struct link_stats *stats = &link->stats;
     uint64_t sample_ns = now > block->sent_ns ? now - block->sent_ns : 1;
+    if (block->repeats) {
+        // Of either transmission: the time since the last one is not longer than a round trip. If it is too
+        // short to be one, an earlier one was answered, late, and the timeout is too short: its doublings
+        // stay.
+        if (2 * sample_ns < stats->srtt_ns)
+            return;
+        link->backoff = 0;
+        if (sample_ns <= stats->srtt_ns)
+            return;
+    }
     if (stats->srtt_ns) {
+        if (sample_ns > stats->srtt_ns + most_above(stats))
+            sample_ns = stats->srtt_ns + most_above(stats);
         uint64_t error_ns =
             sample_ns > stats->srtt_ns ? sample_ns - stats->srtt_ns : stats->srtt_ns - sample_ns;
         stats->rttvar_ns = (3 * stats->rttvar_ns + error_ns) / 4;
@@ -61,6 +78,7 @@ static void acknowledge(struct link *link, uint64_t sequence, uint64_t now) {
     if (link->cursor < sequence)
         link->cursor = sequence;
     link->progress_ns = now;
+    link->ignored_nak_ns = 0;
     if (sequence > link->outstanding_until_seq) // a block after the repeats was answered, and so were they
         link->naks_outstanding = 0;
 }
@@ -71,6 +89,7 @@ static void handle_nak(struct link *link, uint64_t now) {
         return; // the repeat is on its way already
     if (link->naks_outstanding && now < link->outstanding_until_ns) {
         link->naks_outstanding--;
+        link->ignored_nak_ns = now;
         return;
     }
     link_rewind(link, now, LEAD_SYNC);
@@ -138,9 +157,34 @@ static void handle_block(struct link *link, const uint8_t *bytes, size_t length,
     memcpy(response->content, bytes + WIRE_HEADER, response->size);
     const struct link_block *asked = const_block_of(link, link->first - 1);
     int known =
-        link->state == LINK_RUNNING && ((link->first - answer) & WIRE_SEQ_MASK) == 0 && !asked->repeated;
+        link->state == LINK_RUNNING && ((link->first - answer) & WIRE_SEQ_MASK) == 0 && !asked->repeats;
     response->sent_ns = known ? asked->sent_ns : 0;
     response->received_ns = now;
+}
+
+// Drops the front of the buffer up to and including the next sync byte.
+static void give_up_partial(struct link *link) {
+    const uint8_t *sync = memchr(link->rx, WIRE_SYNC, link->rx_used);
+    size_t drop = sync ? (size_t)(sync - link->rx) + 1 : link->rx_used;
+    link->stats.bytes_invalid += drop;
+    link->rx_used -= drop;
+    memmove(link->rx, link->rx + drop, link->rx_used);
+}
+
+// Returns whether an empty block stands behind a sync byte in the incomplete one. Then the length of that one
+// is wrong. Without this, the answers to repeats, which follow each other within GAP_NS, would be taken for a
+// part of it.
+static int holds_answer(const struct link *link) {
+    for (size_t at = WIRE_HEADER; at + WIRE_BLOCK_MIN < link->rx_used; at++) {
+        const uint8_t *bytes = link->rx + at + 1;
+        uint8_t answer[WIRE_BLOCK_MIN];
+        if (link->rx[at] != WIRE_SYNC || bytes[0] != WIRE_BLOCK_MIN || bytes[1] >> 4 != WIRE_SEQ_MARK >> 4)
+            continue;
+        wire_block_finish(answer, 0, bytes[1] & WIRE_SEQ_MASK);
+        if (memcmp(bytes, answer, WIRE_BLOCK_MIN) == 0)
+            return 1;
+    }
+    return 0;
 }
 
 // Takes one step through the receive buffer; returns 0 when it needs more bytes.
@@ -154,16 +198,10 @@ static int scan_once(struct link *link, uint64_t now, struct link_response *resp
         handle_block(link, link->rx + skip, length, now, response);
     link->rx_used -= skip + length;
     memmove(link->rx, link->rx + skip + length, link->rx_used);
-    return found != WIRE_MORE;
-}
-
-// Drops the front of the buffer up to and including the next sync byte.
-static void give_up_partial(struct link *link) {
-    const uint8_t *sync = memchr(link->rx, WIRE_SYNC, link->rx_used);
-    size_t drop = sync ? (size_t)(sync - link->rx) + 1 : link->rx_used;
-    link->stats.bytes_invalid += drop;
-    link->rx_used -= drop;
-    memmove(link->rx, link->rx + drop, link->rx_used);
+    if (found != WIRE_MORE || !holds_answer(link))
+        return found != WIRE_MORE;
+    give_up_partial(link);
+    return 1;
 }
 
 uint64_t link_partial_deadline(const struct link *link) {

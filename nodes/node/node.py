@@ -532,6 +532,17 @@ class Node:
     def _handle_shutdown(self, message: Message) -> None:
         self.shut_down_for(message.integer("static_string_id"))
 
+    def stopped_the_bus(self, static_string_id: int) -> None:
+        """Record that the node shut down and stopped all others, as a frame on the bus says.
+
+        A frame with a number that the node's firmware does not have is forged, or the reason did not fit:
+        then the nodes' own reports count.
+        """
+        if self.state in _SHUTDOWN_MEANS:
+            known = self.dictionary.enumerations.get("static_string_id")
+            if known is not None and known.name_of(static_string_id) is not None:
+                self.shut_down_for(static_string_id)
+
     def shut_down_for(self, static_string_id: int) -> None:
         """Record that the node shut down, and the text that it gives as the reason."""
         if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:

@@ -55,6 +55,16 @@ def steps(amount: Amount) -> Iterator[Step]:
         (python, "-m", "coordinator.cli.main", "simulate", "--seeds", f"0:{amount.seeds}"),
         r"^.*\d+ failed.*$",
     )
+    for share, prints in ((5, 300), (10, 100)):
+        yield Step(
+            f"loss-{share}",
+            f"{prints} prints on a bus that loses {share} % of the frames",
+            (
+                *(python, "-m", "coordinator.cli.main", "simulate", f"loss_{share}_percent"),
+                *("--seeds", f"0:{prints}"),
+            ),
+            r"^.*\d+ failed.*$",
+        )
     yield Step("mutants", "planted bugs", (python, "tests/sim/mutants.py"), r"^\d+ of \d+ planted bugs.*$")
     yield Step(
         "mutation",

@@ -18,6 +18,8 @@ def test_the_steps_are_those_of_the_manual() -> None:
     assert names == [
         "full",
         "sim",
+        "loss-5",
+        "loss-10",
         "mutants",
         "mutation",
         "arm",

@@ -42,7 +42,8 @@ class Sent:
     commands: int = 0
     req_clocks: list[int] = field(default_factory=list)
     sent_ns: int = 0
-    repeated: bool = False
+    due_clock: int = 0
+    repeats: int = 0
     on_wire: int = 0
 
 
@@ -82,6 +83,7 @@ class LinkModel:
         self.last_ack: int | None = None
         self.naks_outstanding = self.outstanding_until_ns = self.outstanding_until = 0
         self.backoff = 0
+        self.ignored_nak_ns = 0
         self.lead_in = "flush"
         self.clock: tuple[float, int, int] | None = None
         self.motion_content = 0
@@ -164,13 +166,17 @@ class LinkModel:
         return at_ns - int(away_ns) if away_ns < float(at_ns) else 0
 
     @property
-    def first_rto_ns(self) -> int:
+    def _answer_ns(self) -> int:
         srtt_ns, rttvar_ns = self.count["srtt_ns"], self.count["rttvar_ns"]
-        return max(srtt_ns + 4 * rttvar_ns if srtt_ns else 100 * MS, 20 * MS)
+        return max(srtt_ns + 4 * rttvar_ns if srtt_ns else 100 * MS, 4 * MS)
+
+    @property
+    def first_rto_ns(self) -> int:
+        return max(self._answer_ns, 20 * MS)
 
     @property
     def rto_ns(self) -> int:
-        return min(self.first_rto_ns << self.backoff, self.lost_after_ns // 4)
+        return min(self.first_rto_ns << self.backoff, self.lost_after_ns // 8)
 
     @property
     def unanswered_since(self) -> int:
@@ -181,7 +187,25 @@ class LinkModel:
     @property
     def _repeat_at(self) -> int:
         since_ns = self.unanswered_since
-        return NEVER if since_ns == NEVER else since_ns + self.rto_ns
+        if since_ns == NEVER:
+            return NEVER
+        left_ns = self._due_ns - since_ns
+        at_ns = since_ns + self.rto_ns
+        if left_ns > 0:  # a sixteenth of the time left, if that is the longer of answer and timeout
+            at_ns = min(at_ns, since_ns + max(left_ns // 16, self._answer_ns))
+        if self.ignored_nak_ns:
+            at_ns = min(at_ns, self.ignored_nak_ns + (self._answer_ns << min(self.backoff, 2)))
+        return at_ns
+
+    @property
+    def _due_ns(self) -> int:
+        """Return when the first command in flight, or the first motion in the queue, is due; 0: unknown."""
+        if self.clock is None:
+            return 0
+        clocks = [sent.due_clock for sent in self._in_flight()]
+        clocks += [command.req_clock for command in self.queues[MOTION][:1]]
+        due = min((clock for clock in clocks if clock), default=0)
+        return self._ns_at(due) if due else 0
 
     @property
     def lost_at(self) -> int:
@@ -207,6 +231,9 @@ class LinkModel:
             self._rewind(now, "flush")
 
     def deadline(self, now: int, allowed: int) -> int:
+        return max(self._next_deadline(now, allowed), now + 1)
+
+    def _next_deadline(self, now: int, allowed: int) -> int:
         if self.state == "lost":
             return NEVER
         at_ns = min(self.lost_at, self._repeat_at, self._partial_at)
@@ -347,11 +374,11 @@ class LinkModel:
         if self.state == "lost" or (self.cursor == self.next and not self._make(now, allowed)):
             return b""
         sent = self.slots[self.cursor % 16]
-        data = bytes([SYNC]) * self._lead_in_bytes + sent.data
-        if not self._fits(len(data)):
+        data = self._wire_form(sent, now)
+        if not data:
             return b""
         if sent.sent_ns:
-            sent.repeated = True
+            sent.repeats = min(sent.repeats + 1, 255)
             self.count["blocks_repeated"] += 1
             self.count["bytes_repeated"] += len(data)
         self.count["blocks_sent"] += 1
@@ -359,6 +386,25 @@ class LinkModel:
         self.lead_in = ""
         sent.sent_ns, sent.on_wire = max(now, 1), len(data)
         self.cursor += 1
+        return data
+
+    def _wire_form(self, sent: Sent, now: int) -> bytes:
+        """Return the bytes of a transmission; none when they do not fit."""
+        lead_in = self._lead_in_bytes
+        soon = 0 < self._due_ns - now < 200 * MS
+        again = self.cursor == self.first and bool(sent.sent_ns) and self.state == "running"
+        twice = again and (soon or sent.repeats > 0)
+        if twice and (lead_in + len(sent.data)) % 8 == 1:
+            lead_in += 1
+        fills = self.lead_in == "flush" and self.state == "running"
+        syncs = bytes([SYNC]) * lead_in
+        data = (bytes(lead_in - 1) + syncs[:1] if fills and lead_in else syncs) + sent.data
+        if not self._fits(len(data)):
+            return b""
+        double = data + bytes([SYNC]) * (-len(data) % 8 + 1) + sent.data
+        if twice and len(double) <= self.window:
+            self.naks_outstanding += 1
+            return double
         return data
 
     def _make(self, now: int, allowed: int) -> bool:
@@ -383,7 +429,8 @@ class LinkModel:
                 self.motion_content += sum(len(command.content) for command in commands)
         self.urgent = self.urgent and bool(self.queues[CONTROL])
         data = block(self.next, b"".join(command.content for command in taken))
-        self.slots[self.next % 16] = Sent(data, kind, len(taken), req_clocks)
+        due_clock = min((command.req_clock for command in taken if command.req_clock), default=0)
+        self.slots[self.next % 16] = Sent(data, kind, len(taken), req_clocks, due_clock=due_clock)
         self.count["commands_sent"] += len(taken)
         if self.first == self.next and self.state != "confirming":
             self.progress_ns = now
@@ -394,6 +441,7 @@ class LinkModel:
         self.naks_outstanding = min(self.naks_outstanding + self.cursor - self.first, 2 * IN_FLIGHT_MAX)
         self.outstanding_until_ns, self.outstanding_until = now + self.rto_ns, self.next
         self.cursor = self.first
+        self.ignored_nak_ns = 0
         if self.lead_in != "flush":
             self.lead_in = lead_in
 
@@ -433,7 +481,10 @@ class LinkModel:
             length = self.rx[0]
             sound = EMPTY <= length <= WHOLE and (len(self.rx) < 2 or self.rx[1] >> 4 == 1)
             if sound and len(self.rx) < length:
-                return found
+                if not any(bytes([SYNC]) + block(seq) in self.rx for seq in range(16)):
+                    return found
+                self.count["bytes_invalid"] += self._hunt()
+                continue
             whole = self.rx[:length]
             if sound and whole[-3:] == crc16(whole[:-3]).to_bytes(2, "big") + bytes([SYNC]):
                 self.rx = self.rx[length:]
@@ -463,7 +514,7 @@ class LinkModel:
         if not content:
             return []
         asked = self.slots[(self.first - 1) % 16]
-        known = self.state == "running" and answer == self.first % 16 and not asked.repeated
+        known = self.state == "running" and answer == self.first % 16 and not asked.repeats
         return [(content, asked.sent_ns if known else 0)]
 
     def _sequence(self, answer: int, empty: bool, now: int) -> None:
@@ -505,31 +556,38 @@ class LinkModel:
             return
         if self.naks_outstanding and now < self.outstanding_until_ns:
             self.naks_outstanding -= 1
+            self.ignored_nak_ns = now
             return
         self._rewind(now, "sync")
 
     def _acknowledge(self, sequence: int, now: int) -> None:
         last = self.slots[(sequence - 1) % 16]
-        if not last.repeated:
-            self._measure(max(now - last.sent_ns, 1))
+        self._measure(max(now - last.sent_ns, 1), sure=not last.repeats)
         for number in range(self.first, sequence):
             for req_clock in self.slots[number % 16].req_clocks:
                 self._note_lead(req_clock, now)
         self.first = sequence
         self.cursor = max(self.cursor, sequence)
         self.progress_ns = now
+        self.ignored_nak_ns = 0
         if sequence > self.outstanding_until:
             self.naks_outstanding = 0
 
-    def _measure(self, sample_ns: int) -> None:
+    def _measure(self, sample_ns: int, *, sure: bool) -> None:
+        """Take a round trip, or, of a repeat, what a round trip takes at least."""
         srtt_ns, rttvar_ns = self.count["srtt_ns"], self.count["rttvar_ns"]
+        if not sure and 2 * sample_ns < srtt_ns:
+            return
+        self.backoff = 0
+        if not sure and sample_ns <= srtt_ns:
+            return
         if srtt_ns:
+            sample_ns = min(sample_ns, srtt_ns + max(srtt_ns, 10 * MS))
             rttvar_ns = (3 * rttvar_ns + abs(sample_ns - srtt_ns)) // 4
             srtt_ns = (7 * srtt_ns + sample_ns) // 8
         else:
             srtt_ns, rttvar_ns = sample_ns, sample_ns // 2
         self.count["srtt_ns"], self.count["rttvar_ns"] = srtt_ns, rttvar_ns
-        self.backoff = 0
 
     def _note_lead(self, req_clock: int, now: int) -> None:
         if self.clock is None:

@@ -90,18 +90,32 @@ static inline size_t go(struct scene *scene) {
     return go_of(scene, LINK_ALL);
 }
 
-// Checks the last transmission: LEAD sync bytes, and one block with CONTENT.
+// Checks the last transmission: LEAD bytes, of which the last is a sync byte (before contact: all of them),
+// and one block with CONTENT.
 static inline void check_block(const struct scene *scene, size_t size, size_t lead, const char *content) {
     size_t length = strlen(content);
     CHECK_EQUAL(size, lead + WIRE_BLOCK_MIN + length);
     for (size_t i = 0; i < lead; i++)
-        CHECK_EQUAL(scene->out[i], WIRE_SYNC);
+        CHECK_EQUAL(scene->out[i],
+                    scene->link.state == LINK_RUNNING && lead > 1 && i + 1 < lead ? 0 : WIRE_SYNC);
     for (size_t i = 0; i < length; i++)
         CHECK_EQUAL(scene->out[lead + WIRE_HEADER + i], content[i]);
     uint8_t whole[WIRE_BLOCK_MAX];
     memcpy(whole + WIRE_HEADER, content, length);
     wire_block_finish(whole, length, scene->out[lead + 1]);
     CHECK(memcmp(whole, scene->out + lead, WIRE_BLOCK_MIN + length) == 0);
+}
+
+// Checks the last transmission: after LEAD bytes one block with CONTENT, and that block once more behind as
+// many sync bytes as bring it, and one of them, into a frame of their own.
+static inline void check_twice(const struct scene *scene, size_t size, size_t lead, const char *content) {
+    size_t length = WIRE_BLOCK_MIN + strlen(content), copy = size - length;
+    check_block(scene, lead + length, lead, content);
+    CHECK_EQUAL(copy % 8, 1);
+    CHECK(copy > lead + length && copy < lead + length + 8);
+    for (size_t i = lead + length; i < copy; i++)
+        CHECK_EQUAL(scene->out[i], WIRE_SYNC);
+    CHECK(memcmp(scene->out + copy, scene->out + lead, length) == 0);
 }
 
 // CONTENT goes now, in one new block; nothing: no block.

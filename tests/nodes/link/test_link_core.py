@@ -158,7 +158,8 @@ def test_a_repeat_starts_with_a_sync_byte_and_a_timeout_flushes_the_node() -> No
     line.pump()
     first, repeat = line.sent
     assert repeat.endswith(first)
-    assert set(repeat[: -len(first)]) == {0x7E}
+    lead_in = repeat[: -len(first)]
+    assert lead_in == bytes(len(lead_in) - 1) + b"~"  # else only a checksum rejects what it completes
     assert len(repeat) >= 64
 
 
@@ -182,18 +183,15 @@ def test_a_nak_repeats_at_once_and_the_round_trip_is_not_measured_by_repeats() -
     assert line.now - start_ns < 6 * MS
 
 
-def test_a_repeated_block_gives_no_round_trip() -> None:
-    """Whether the answer belongs to the block or to its repeat cannot be known (Karn)."""
+def test_a_repeated_block_gives_a_lower_bound_of_the_round_trip() -> None:
+    """Whether the answer belongs to the block or to its repeat cannot be known: only the later counts."""
     line = connected()
     late = line.counts[TO_NODE]
     line.fault = lambda way, index, data: [(21 * MS if (way, index) == (TO_NODE, late) else 0, data)]
     line.link.send(store(1))
     line.run()
     assert line.link.stats.timeouts == 1
-    assert line.link.stats.srtt_ns == 2 * MS
-    assert line.link.stats.rto_ns == 40 * MS  # and the doubled timeout stays until there is one
-    line.link.send(store(2))
-    line.run()
+    assert line.link.stats.srtt_ns == (7 * 2 * MS + 3 * MS) // 8
     assert line.link.stats.rto_ns == 20 * MS
 
 
@@ -313,7 +311,7 @@ def test_silence_loses_the_link_once_and_in_time(lost_after_ns: int) -> None:
         line.pump()
     assert line.now - start_ns == lost_after_ns
     assert line.link.c.cause == lib.LINK_CAUSE_SILENT
-    assert 4 <= line.link.stats.timeouts <= 8
+    assert 8 <= line.link.stats.timeouts <= 10
     assert line.link.send(store(2)) == line.link.send_urgent(STOP) == lib.LINK_GONE
     assert line.link.send_batch(record(store(2))) == lib.LINK_GONE
     assert line.link.next_block(line.now) == b""
@@ -322,7 +320,9 @@ def test_silence_loses_the_link_once_and_in_time(lost_after_ns: int) -> None:
 
 def test_a_node_that_answers_but_accepts_nothing_is_told_apart() -> None:
     line = connected()
-    line.fault = lambda way, index, data: [(0, data[:-3] + b"xx~")] if way == TO_NODE else [(0, data)]
+    line.fault = lambda way, index, data: (
+        [(0, data.replace(store(1), b"xxx"))] if way == TO_NODE else [(0, data)]
+    )
     line.link.send(store(1))
     while not line.link.lost:
         assert line.step()

@@ -209,16 +209,16 @@ static void what_is_behind_a_block_that_was_cut_off_is_heard(void) {
 static void the_end_of_a_wait_wakes_before_a_later_repeat(void) {
     struct scene scene;
     open_link(&scene, WINDOW, SECOND);
-    run_up(&scene, 200 * MS); // a timeout of 250 ms
+    run_up(&scene, 200 * MS); // a timeout of 125 ms
     uint8_t cut_off[] = {20, 0x10};
     control(&scene, 'c', 1);
     check_goes(&scene, "c");
     uint64_t sent_ns = scene.now;
     comes(&scene, cut_off, 2);
     CHECK_EQUAL(deadline_of(&scene), sent_ns + 100 * MS);
-    scene.now += 160 * MS;
+    scene.now += 60 * MS;
     comes(&scene, cut_off, 1);
-    CHECK_EQUAL(deadline_of(&scene), sent_ns + 250 * MS);
+    CHECK_EQUAL(deadline_of(&scene), sent_ns + 125 * MS);
 }
 
 // --------------------------------------------------------------------------------------------------- leads

@@ -164,7 +164,7 @@ class Pair:
         """Take DATA as a node does, which may lose it, and answer, which may get lost."""
         if self.random.random() < self.loss:
             return
-        whole = data.lstrip(b"~")
+        whole = data.lstrip(b"~\0")
         if whole[1] & 15 == self.expected:
             self.expected = (self.expected + 1) & 15
         at_ns = self.now + self.random.choice((0, 300_000, MS, 2 * MS, 40 * MS))

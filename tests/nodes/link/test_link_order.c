@@ -370,7 +370,7 @@ static void the_window_is_filled_to_the_last_byte(void) {
 static void a_full_window_wakes_nobody(void) {
     struct scene scene;
     open_link(&scene, 64, SECOND);
-    run_up(&scene, 100 * MS); // a timeout of 250 ms
+    run_up(&scene, 100 * MS); // a timeout of 125 ms
     clock(&scene, scene.now);
     control(&scene, 'c', 59);
     CHECK_EQUAL(go(&scene), 64);
@@ -380,10 +380,10 @@ static void a_full_window_wakes_nobody(void) {
     uint64_t full_ns = sent_ns + 10 * TICK + 2 * MS;
     CHECK_EQUAL(deadline_of(&scene), full_ns);
     scene.now = full_ns;
-    CHECK_EQUAL(deadline_of(&scene), sent_ns + 250 * MS);
+    CHECK_EQUAL(deadline_of(&scene), sent_ns + 125 * MS);
     CHECK_EQUAL(go(&scene), 0);
     motion(&scene, 'o', 50, START + 512, START + 1024);
-    CHECK_EQUAL(deadline_of(&scene), sent_ns + 250 * MS); // before the gate
+    CHECK_EQUAL(deadline_of(&scene), sent_ns + 125 * MS); // before the gate
 }
 
 // Nor does motion that begins to press just now.
@@ -395,11 +395,11 @@ static void a_full_window_wakes_nobody_for_what_presses(void) {
     control(&scene, 'c', 59);
     CHECK_EQUAL(go(&scene), 64);
     uint64_t sent_ns = scene.now;
-    motion(&scene, 'm', 1, 0, START + 128); // 250 ms
+    motion(&scene, 'm', 1, 0, START + 104); // 203.125 ms
     motion(&scene, 'n', 1, START + 112, START + 512);
-    CHECK_EQUAL(deadline_of(&scene), sent_ns + 150 * MS);
-    scene.now = sent_ns + 150 * MS;
-    CHECK_EQUAL(deadline_of(&scene), sent_ns + 250 * MS);
+    CHECK_EQUAL(deadline_of(&scene), sent_ns + 103125000);
+    scene.now = sent_ns + 103125000;
+    CHECK_EQUAL(deadline_of(&scene), sent_ns + 125 * MS);
 }
 
 static void bulk_leaves_a_block_of_the_window(void) {

@@ -145,9 +145,9 @@ def test_a_window_is_that_of_a_block_at_least() -> None:
 def test_a_serial_line_wants_room_for_the_longest_transmission() -> None:
     line = Line()
     line.link.send(ask(1))
-    out = ffi.new("uint8_t[]", 128)
-    assert lib.io_next(line.driver.bus, line.driver.now, 0, out, 127) == 0
-    assert lib.io_next(line.driver.bus, line.driver.now, 0, out, 128) == 64
+    out = ffi.new("uint8_t[]", 144)
+    assert lib.io_next(line.driver.bus, line.driver.now, 0, out, 143) == 0
+    assert lib.io_next(line.driver.bus, line.driver.now, 0, out, 144) == 64
 
 
 def test_a_clock_is_positive_and_finite() -> None:

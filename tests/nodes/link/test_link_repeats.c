@@ -22,14 +22,14 @@ static void block_goes(struct scene *scene, char tag, size_t size) {
 
 // ------------------------------------------------------------------------------------------------ timeouts
 
-static void each_timeout_doubles_the_next_up_to_a_quarter_of_what_loses_the_link(void) {
-    static const uint64_t waits_ms[] = {20, 40, 80, 160, 250, 250};
+static void each_timeout_doubles_the_next_up_to_an_eighth_of_what_loses_the_link(void) {
+    static const uint64_t waits_ms[] = {20, 40, 80, 125, 125, 125, 125, 125, 125};
     struct scene scene;
     open_running(&scene, WINDOW);
     struct link_stats before = stats_of(&scene);
     block_goes(&scene, 'a', 3);
     uint64_t sent_ns = scene.now;
-    for (unsigned i = 0; i < 6; i++) {
+    for (unsigned i = 0; i < 9; i++) {
         CHECK_EQUAL(link_unanswered_since(&scene.link), scene.now);
         CHECK_EQUAL(stats_of(&scene).rto_ns, waits_ms[i] * MS);
         uint64_t due_ns = scene.now + waits_ms[i] * MS;
@@ -42,15 +42,18 @@ static void each_timeout_doubles_the_next_up_to_a_quarter_of_what_loses_the_link
         CHECK_EQUAL(link_unanswered_since(&scene.link), NEVER);
         CHECK_EQUAL(deadline_of(&scene), sent_ns + SECOND);
         CHECK_OFFER(&scene, LINK_CONTROL, 0, 0);
-        check_block(&scene, go(&scene), 56, "aaa");
+        if (i == 0)
+            check_block(&scene, go(&scene), 56, "aaa");
+        else // what was lost twice goes twice
+            check_twice(&scene, go(&scene), 56, "aaa");
     }
     struct link_stats stats = stats_of(&scene);
-    CHECK_EQUAL(stats.blocks_sent - before.blocks_sent, 7);
-    CHECK_EQUAL(stats.bytes_sent - before.bytes_sent, 8 + 6 * 64);
-    CHECK_EQUAL(stats.blocks_repeated, 6);
-    CHECK_EQUAL(stats.bytes_repeated, 6 * 64);
+    CHECK_EQUAL(stats.blocks_sent - before.blocks_sent, 10);
+    CHECK_EQUAL(stats.bytes_sent - before.bytes_sent, 8 + 9 * 64 + 8 * 9);
+    CHECK_EQUAL(stats.blocks_repeated, 9);
+    CHECK_EQUAL(stats.bytes_repeated, 9 * 64 + 8 * 9);
     CHECK_EQUAL(stats.commands_sent - before.commands_sent, 1);
-    CHECK_EQUAL(scene.link.in_flight_bytes, 64);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 73);
     CHECK_EQUAL(deadline_of(&scene), sent_ns + SECOND);
     time_passes(&scene, sent_ns + SECOND - 1);
     CHECK_EQUAL(scene.link.state, LINK_RUNNING);
@@ -59,32 +62,181 @@ static void each_timeout_doubles_the_next_up_to_a_quarter_of_what_loses_the_link
     CHECK_EQUAL(scene.link.cause, LINK_CAUSE_SILENT);
 }
 
-// An acknowledgement of what was repeated may belong to either: the timeout stays until one is sure.
-static void only_a_sure_round_trip_undoes_the_doublings(void) {
+// An acknowledgement of what was repeated may be of either transmission. The time since the last one is not
+// longer than a round trip: it is measured if it is longer than was known, and ends the doublings if it could
+// be one.
+static void the_last_repeat_ends_the_doublings_if_it_can_have_been_answered(void) {
+    static const struct {
+        uint64_t after_ns, srtt_ns, rto_ns;
+    } cases[] = {
+        {2 * MS - 1, 4 * MS, 40 * MS}, // an earlier one was answered late: the timeout is too short
+        {2 * MS, 4 * MS, 20 * MS},
+        {4 * MS, 4 * MS, 20 * MS},
+        {12 * MS, 5 * MS, 29 * MS - 2 * MS},
+    };
+    for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
+        struct scene scene;
+        open_link(&scene, WINDOW, SECOND);
+        run_up(&scene, 4 * MS);
+        for (unsigned k = 0; k < 20; k++) { // until the deviation is small
+            block_goes(&scene, 'z', 1);
+            scene.now += 4 * MS;
+            acknowledge_all(&scene);
+        }
+        uint64_t rttvar_ns = stats_of(&scene).rttvar_ns;
+        CHECK(rttvar_ns < MS / 10);
+        block_goes(&scene, 'a', 3);
+        time_passes(&scene, scene.now + 20 * MS);
+        CHECK_EQUAL(go(&scene), 64);
+        CHECK_EQUAL(stats_of(&scene).rto_ns, 40 * MS);
+        scene.now += cases[i].after_ns;
+        acknowledge_all(&scene);
+        CHECK_EQUAL(stats_of(&scene).srtt_ns, cases[i].srtt_ns);
+        if (cases[i].after_ns <= 4 * MS)
+            CHECK_EQUAL(stats_of(&scene).rto_ns, cases[i].rto_ns);
+        CHECK_EQUAL(scene.link.backoff, cases[i].after_ns < 2 * MS);
+    }
+}
+
+// An acknowledgement may get lost; the node's next answer replaces it, and its time is no round trip.
+static void no_sample_moves_the_mean_far(void) {
+    static const struct {
+        uint64_t trip_ns, sample_ns;
+    } steps[] = {{13 * MS, 13 * MS}, {14 * MS, 14 * MS}, {15 * MS, 14 * MS}, {900 * MS, 14 * MS}};
+    for (size_t i = 0; i < sizeof steps / sizeof *steps; i++) {
+        struct scene scene;
+        open_link(&scene, WINDOW, SECOND);
+        run_up(&scene, 4 * MS);
+        block_goes(&scene, 'a', 3);
+        uint64_t srtt_ns = stats_of(&scene).srtt_ns;
+        CHECK_EQUAL(srtt_ns, 4 * MS);
+        scene.now += steps[i].trip_ns;
+        acknowledge_all(&scene);
+        CHECK_EQUAL(stats_of(&scene).srtt_ns, (7 * srtt_ns + steps[i].sample_ns) / 8);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------
+// deadlines
+
+enum { HERTZ = 1000, TICKS = 1000000 };
+
+// A running link with round trips of 1 ns, whose node's clock counts ms.
+static void open_timed(struct scene *scene) {
+    open_running(scene, WINDOW);
+    CHECK_EQUAL(link_set_clock(&scene->link, HERTZ, scene->now, TICKS), LINK_OK);
+}
+
+// A timeout is a sixteenth of the time left, but neither longer than others nor shorter than an answer takes.
+static void a_timeout_knows_the_deadline(void) {
+    static const struct {
+        unsigned left_ms;
+        uint64_t timeout_ns;
+    } cases[] = {{1000, 20 * MS}, {320, 20 * MS}, {319, 19937500}, {160, 10 * MS},
+                 {64, 4 * MS},    {5, 4 * MS},    {0, 20 * MS}}; // too late
+    for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
+        struct scene scene;
+        open_timed(&scene);
+        motion(&scene, 'm', 3, 0, TICKS + cases[i].left_ms);
+        check_goes(&scene, "mmm");
+        CHECK_EQUAL(deadline_of(&scene), scene.now + cases[i].timeout_ns);
+        uint64_t at_ns = deadline_of(&scene);
+        time_passes(&scene, at_ns - 1);
+        CHECK_EQUAL(stats_of(&scene).timeouts, 0);
+        time_passes(&scene, at_ns);
+        CHECK_EQUAL(stats_of(&scene).timeouts, 1);
+    }
+}
+
+// The earliest command counts, of any class, in flight or waiting for it.
+static void whatever_waits_has_a_deadline(void) {
+    struct scene scene;
+    open_timed(&scene);
+    control(&scene, 'c', 3);
+    check_goes(&scene, "ccc");
+    CHECK_EQUAL(deadline_of(&scene), scene.now + 20 * MS);
+    CHECK_EQUAL(try_send(&scene, LINK_CONTROL, 'd', 3, 0, TICKS + 240), LINK_OK);
+    check_goes(&scene, "ddd");
+    CHECK_EQUAL(deadline_of(&scene), scene.now + 15 * MS);
+    motion(&scene, 'm', 3, TICKS + 50, TICKS + 160);
+    motion(&scene, 'n', 3, TICKS + 50, TICKS + 80); // not at the front
+    CHECK_EQUAL(deadline_of(&scene), scene.now + 10 * MS);
+}
+
+// A repeat whose commands are due within 200 ms goes twice; the blocks behind it do not.
+static void what_is_due_soon_is_repeated_twice(void) {
+    for (unsigned left_ms = 199; left_ms <= 240; left_ms += 41) {
+        struct scene scene;
+        open_timed(&scene);
+        motion(&scene, 'm', 59, 0, TICKS + left_ms);
+        motion(&scene, 'n', 3, 0, TICKS + left_ms);
+        CHECK_EQUAL(go(&scene), 64); // the first transmission is one
+        check_goes(&scene, "nnn");
+        uint64_t outstanding = scene.link.naks_outstanding;
+        time_passes(&scene, deadline_of(&scene));
+        char content[WIRE_CONTENT_MAX + 1] = {0};
+        memset(content, 'm', WIRE_CONTENT_MAX);
+        size_t size = go(&scene);
+        if (left_ms < 200)
+            check_twice(&scene, size, 2, content); // 66 bytes: the gap is no whole frame
+        else
+            check_block(&scene, size, 1, content);
+        check_goes(&scene, "nnn");
+        CHECK_EQUAL(scene.link.naks_outstanding, outstanding + 2 + (left_ms < 200));
+        CHECK_EQUAL(scene.link.in_flight_bytes, size + 8);
+        acknowledge_all(&scene);
+        CHECK_EQUAL(scene.link.in_flight_bytes, 0);
+    }
+}
+
+static void a_copy_that_does_not_fit_the_window_is_left_out(void) {
+    for (uint64_t window = 136; window <= 137; window++) {
+        struct scene scene;
+        open_timed(&scene);
+        CHECK_EQUAL(link_set_receive_window(&scene.link, window), LINK_OK);
+        motion(&scene, 'm', 59, 0, TICKS + 100);
+        CHECK_EQUAL(go(&scene), 64);
+        time_passes(&scene, deadline_of(&scene));
+        CHECK_EQUAL(go(&scene), window < 137 ? 66 : 137);
+    }
+}
+
+// A nak that a repeat may have caused says that the node answers: it has the time of an answer for another
+// one.
+static void an_ignored_nak_shortens_the_timeout(void) {
     struct scene scene;
     open_running(&scene, WINDOW);
     block_goes(&scene, 'a', 3);
     time_passes(&scene, scene.now + 20 * MS);
-    CHECK_EQUAL(go(&scene), 64);
-    acknowledge_all(&scene);
-    CHECK_EQUAL(stats_of(&scene).srtt_ns, 1);
-    CHECK_EQUAL(stats_of(&scene).rto_ns, 40 * MS);
-    block_goes(&scene, 'b', 3);
+    CHECK(go(&scene) > 0);
+    for (unsigned shift = 1; shift <= 3; shift++) { // doubled, twice at most
+        scene.now += MS;
+        nak(&scene);
+        CHECK_EQUAL(stats_of(&scene).naks, shift);
+        CHECK_EQUAL(go(&scene), 0);
+        CHECK_EQUAL(deadline_of(&scene), scene.now + (4 * MS << (shift < 2 ? shift : 2)));
+        time_passes(&scene, deadline_of(&scene));
+        check_twice(&scene, go(&scene), 56, "aaa");
+    }
+    scene.now += MS;
+    nak(&scene);
     scene.now += MS;
     acknowledge_all(&scene);
-    CHECK_EQUAL(stats_of(&scene).rto_ns, 20 * MS);
-    CHECK_EQUAL(deadline_of(&scene), NEVER);
-    CHECK_EQUAL(scene.link.in_flight_bytes, 0);
+    control(&scene, 'b', 1); // which that nak says nothing about
+    check_goes(&scene, "b");
+    CHECK_EQUAL(deadline_of(&scene), scene.now + 20 * MS);
 }
+
+// -------------------------------------------------------------------------------------------- round trips
 
 static void round_trips_make_the_timeout(void) {
     static const struct {
         uint64_t trip_ns, srtt_ns, rttvar_ns, rto_ns;
     } steps[] = {
         {10000000, 10000000, 5000000, 30000000}, // the first: half of it as the deviation
-        {10000000, 10000000, 3750000, 25000000}, {30000000, 12500000, 7812500, 43750000},
-        {2500000, 11250000, 8359375, 44687500},  {11250000, 11250000, 6269531, 36328124},
-        {0, 9843750, 7514648, 39902342},
+        {10000000, 10000000, 3750000, 25000000}, {30000000, 11250000, 5312500, 32500000},
+        {2500000, 10156250, 6171875, 34843750},  {11250000, 10292968, 4902343, 29902340},
+        {0, 9006347, 6249999, 34006343},
     };
     struct scene scene;
     open_link(&scene, WINDOW, SECOND);
@@ -101,8 +253,8 @@ static void round_trips_make_the_timeout(void) {
             CHECK_EQUAL(stats.rttvar_ns, steps[i].rttvar_ns);
             CHECK_EQUAL(stats.rto_ns, steps[i].rto_ns);
         } else { // at once is one ns
-            CHECK_EQUAL(stats.srtt_ns, (7 * 11250000ULL + 1) / 8);
-            CHECK_EQUAL(stats.rttvar_ns, (3 * 6269531ULL + 11249999) / 4);
+            CHECK_EQUAL(stats.srtt_ns, (7 * 10292968ULL + 1) / 8);
+            CHECK_EQUAL(stats.rttvar_ns, (3 * 4902343ULL + 10292967) / 4);
         }
         if (i)
             control(&scene, 'a', 1);
@@ -239,8 +391,12 @@ static void three_blocks_go(struct scene *scene) {
     block_goes(scene, 'c', 30);
 }
 
+// The first of them twice from the second time on.
 static void three_blocks_go_again(struct scene *scene, size_t lead) {
-    check_block(scene, go(scene), lead, "aaaaaaaaaa");
+    if (scene->link.blocks[scene->link.first % LINK_SLOTS].repeats)
+        check_twice(scene, go(scene), lead, "aaaaaaaaaa");
+    else
+        check_block(scene, go(scene), lead, "aaaaaaaaaa");
     check_block(scene, go(scene), 0, "bbbbbbbbbbbbbbbbbbbb");
     check_block(scene, go(scene), 0, "cccccccccccccccccccccccccccccc");
     CHECK_EQUAL(go(scene), 0);
@@ -276,7 +432,7 @@ static void naks_that_repeats_may_cause_are_ignored(void) {
     CHECK_EQUAL(go(&scene), 0);
     scene.now++;
     nak(&scene);
-    CHECK_EQUAL(scene.link.naks_outstanding, 5);
+    CHECK_EQUAL(scene.link.naks_outstanding, 6);
     three_blocks_go_again(&scene, 1);
     CHECK_EQUAL(stats_of(&scene).acks_duplicate, 0);
 }
@@ -503,8 +659,14 @@ static void a_sleep_counts_as_a_quarter_at_most(void) {
 }
 
 int main(void) {
-    each_timeout_doubles_the_next_up_to_a_quarter_of_what_loses_the_link();
-    only_a_sure_round_trip_undoes_the_doublings();
+    each_timeout_doubles_the_next_up_to_an_eighth_of_what_loses_the_link();
+    the_last_repeat_ends_the_doublings_if_it_can_have_been_answered();
+    no_sample_moves_the_mean_far();
+    a_timeout_knows_the_deadline();
+    whatever_waits_has_a_deadline();
+    what_is_due_soon_is_repeated_twice();
+    a_copy_that_does_not_fit_the_window_is_left_out();
+    an_ignored_nak_shortens_the_timeout();
     round_trips_make_the_timeout();
     the_last_block_of_several_is_measured();
     a_timeout_flushes_the_node();

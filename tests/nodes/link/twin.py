@@ -112,14 +112,18 @@ class WindowObserver:
     most_blocks: int = 0
 
     def sent(self, data: bytes) -> None:
-        whole = data.lstrip(bytes([SYNC]))
-        assert len(whole) == whole[0], "one transmission is one block"
+        body = data.lstrip(bytes([SYNC, 0]))
+        whole = body[: body[0]]
+        copy = body[len(whole) :].lstrip(bytes([SYNC]))
+        assert copy in {b"", whole}, "one transmission is one block, or that block twice"
         seq = whole[1] & 15
         if len(whole) == 5:  # first contact: no commands, and any sequence
             self.flying.clear()
-        if len(whole) == 5 or seq == (self.newest + 1) & 15:
-            self.flying[seq] = len(whole)
-            self.newest = seq
+        elif seq != (self.newest + 1) & 15:  # a repeat: what is in flight counts from here
+            known = dict.fromkeys(self.flying, 0)
+            self.flying = known if seq in known else {seq: 0, **known}
+        self.flying[seq] = len(body)
+        self.newest = seq
         self.most_bytes = max(self.most_bytes, sum(self.flying.values()))
         self.most_blocks = max(self.most_blocks, len(self.flying))
         assert sum(self.flying.values()) <= self.window
