@@ -92,7 +92,7 @@ def test_a_restart_ends_the_job_that_prints(tmp_path: Path, *, paused: bool) -> 
         if paused:
             await stage.call("job.pause")
             await stage.until_state("paused")
-        with pytest.raises(ApiError, match="RESTART cannot run while a job prints|a job prints"):
+        with pytest.raises(ApiError, match="a job prints"):
             await run(stage, "M105\nRESTART")
         assert stage.service.active_job is not None
         await run(stage, "FIRMWARE_RESTART")

@@ -109,7 +109,7 @@ async def _run(service: MachineService, params: dict[str, Any]) -> Value:
 
 
 def _restarted(service: MachineService, names: list[str]) -> bool:
-    """Restart a stopped machine, or one with a job, if NAMES ask for nothing else; return whether they did."""
+    """Restart a stopped machine, or one with a job, if NAMES ask for nothing else; return whether it was."""
     over = service.state in (ServiceState.SHUTDOWN, ServiceState.ERROR)
     if len(names) != 1 or names[0] not in RESTARTS or not (over or service.active_job is not None):
         return False
