@@ -10,4 +10,3 @@ build/frontends/$(MOONRAKER):
 
 frontends: setup build/frontends/$(MOONRAKER)
 	$(BIN)/python -m tests.frontends.moonraker build/frontends/bin/moonraker
-	$(BIN)/python -m tests.frontends build/frontends/bin/moonraker ../shared/frontends
