@@ -60,6 +60,8 @@ validate_config: False
 [authorization]
 trusted_clients:
     127.0.0.1
+cors_domains:
+    *
 [file_manager]
 enable_object_processing: False
 [history]

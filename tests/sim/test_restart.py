@@ -83,6 +83,27 @@ def test_firmware_restart_resets_nodes_that_are_configured_as_they_should_be(
     on_stage(tmp_path, go)
 
 
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_restart_ends_the_job_that_prints(tmp_path: Path, *, paused: bool) -> None:
+    async def go(stage: Served) -> None:
+        stage.write_job("G28\n" + "G1 X100 F6000\nG1 X20 F6000\n" * 200)
+        await stage.call("job.start", file="job.gcode")
+        await stage.until(lambda: stage.tree.get("position.moving") is True, "motion")
+        if paused:
+            await stage.call("job.pause")
+            await stage.until_state("paused")
+        with pytest.raises(ApiError, match="a job prints"):
+            await run(stage, "M105\nRESTART")
+        assert stage.service.active_job is not None
+        await run(stage, "FIRMWARE_RESTART")
+        await begun_anew(stage, 2)
+        assert stage.service.active_job is None
+        await run(stage, "G28\nG1 X5 F6000")
+        assert (await counts(stage))["stepper_x"] != 0
+
+    on_stage(tmp_path, go)
+
+
 @pytest.mark.parametrize("command", ["RESTART", "FIRMWARE_RESTART"])
 def test_nodes_that_are_shut_down_come_back(tmp_path: Path, command: str) -> None:
     async def go(stage: Served) -> None:
@@ -128,10 +149,9 @@ def test_a_job_does_not_begin_anew(tmp_path: Path) -> None:
         stage.write_job("G28\n" + "G1 X50 F600\nG1 X5\n" * 20)
         await stage.call("job.start", file="job.gcode")
         await stage.until(lambda: bool(stage.tree.get("position.moving")), "motion")
-        for method, params in (("gcode.run", {"script": "FIRMWARE_RESTART"}), ("machine.restart", {})):
-            with pytest.raises(ApiError, match="job") as error:
-                await stage.call(method, **params)
-            assert error.value.code == "busy"
+        with pytest.raises(ApiError, match="job") as error:
+            await stage.call("machine.restart")
+        assert error.value.code == "busy"
         await stage.call("job.cancel")
         await stage.until_job("cancelled")
 

@@ -109,11 +109,14 @@ async def _run(service: MachineService, params: dict[str, Any]) -> Value:
 
 
 def _restarted(service: MachineService, names: list[str]) -> bool:
-    """Restart a stopped machine if NAMES ask for nothing else; return whether they did."""
+    """Restart a stopped machine, or one with a job, if NAMES ask for nothing else; return whether it was."""
     over = service.state in (ServiceState.SHUTDOWN, ServiceState.ERROR)
-    if not over or len(names) != 1 or names[0] not in RESTARTS:
+    if len(names) != 1 or names[0] not in RESTARTS or not (over or service.active_job is not None):
         return False
-    service.restart(firmware=RESTARTS[names[0]])
+    if over:
+        service.restart(firmware=RESTARTS[names[0]])
+    else:
+        service.restart_in_job(firmware=RESTARTS[names[0]])
     return True
 
 

@@ -360,6 +360,12 @@ class MachineService:
                 raise ApiError("busy", "the machine moves; wait until it stands, or cancel the job first")
         self._restart_now(firmware)
 
+    def restart_in_job(self, *, firmware: bool) -> None:
+        """Cancel the job, which ends before its next line, and restart when its moves are done."""
+        assert self.active_job is not None
+        self.active_job.cancel()
+        self._restart_now(firmware)
+
     def _restart_now(self, firmware: bool) -> None:
         self._reset_nodes = firmware
         self._restart.set()
