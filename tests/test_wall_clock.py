@@ -15,6 +15,7 @@ READ_BY = {
     "canbus_tools/bus/computer.py": "times of frames in recordings",
     "canbus_tools/inject/socketcand_server.py": "times of frames, as the protocol has them",
     "canbus_tools/monitor/text.py": "how long ago a recorded node was heard",
+    "coordinator/front_ends/log_file.py": "times of lines, for people",
     "coordinator/service/api/machine.py": "when the service began, for people",
     "coordinator/service/state/log_ring.py": "time of a line of the log",
     "coordinator/web/server.py": "age of sessions, which outlive the process",

@@ -65,7 +65,7 @@ def test_a_fan_whose_sensor_is_silent_runs_at_its_highest_speed(stage: HeatMachi
 def test_a_hotends_fan_is_not_stopped_by_a_torn_wire(stage: HeatMachine) -> None:
     async def main() -> None:
         sensor = Sensor(stage)
-        await sensor.good(4)
+        await sensor.good(6)
         assert stage.status("heater_fan hotend")["speed"] == 1
         await sensor.bad(3)
         await asyncio.sleep(0.1)
