@@ -19,7 +19,7 @@ from typing import Final
 from tests.arm.modules import ROOT, build_tree
 from tests.arm.target import ArmError, Target, missing_packages, run, targets
 
-FOLDER: Final = ROOT / "build" / "arm"
+FOLDER: Final = ROOT / "build" / "emulated"
 SHARED: Final = ROOT.parent / "shared" / "data"
 SCENARIOS: Final = ("long_print", "loss_1_percent", "uart_loss", "rollover", "bad_day")
 LINES: Final = 1500

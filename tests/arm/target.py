@@ -72,7 +72,7 @@ class Target:
         shutil.rmtree(partly, ignore_errors=True)
         partly.parent.mkdir(parents=True, exist_ok=True)
         packages = f"--include={','.join(PACKAGES)}"
-        extract = ("mmdebstrap", "--variant=extract", "--format=directory")
+        extract = ("mmdebstrap", "--variant=extract", "--skip=output/dev", "--format=directory")
         run([*extract, f"--architectures={self.debian}", packages, SUITE, str(partly), MIRROR])
         partly.rename(self.root)
 

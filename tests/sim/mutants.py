@@ -30,7 +30,9 @@ COPIED: Final = (
     *("coordinator", "nodes", "firmware", "config", "build", "canbus_tools", "tests", "docs"),
     *("pyproject.toml", "setup.py"),
 )
-LEFT_OUT: Final = shutil.ignore_patterns("__pycache__", "*.o", "*.d", "mutation")
+LEFT_OUT: Final = shutil.ignore_patterns(
+    "__pycache__", "*.o", "*.d", "mutation", "emulated", "frontends", "octoprint"
+)
 
 
 @dataclass(frozen=True, slots=True)
