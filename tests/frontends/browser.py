@@ -129,7 +129,9 @@ def drive(screen: Screen, api: Moonraker, pictures: Path | None) -> Iterator[str
     _print_from_list(screen)
     until(lambda: api.print_state() == "printing", "printing")
     until(lambda: _field(api, "print_stats", "print_duration") > 1.0, "the first extrusion")
-    shown = page.get_by_text(re.compile(r"^\s*\d+% Printing\s*$" if mainsail else r"^\s*Printing\s*$", re.I))
+    shown = page.get_by_text(
+        re.compile(r"^\s*\d+% Printing\s*$" if mainsail else r"^\s*Printing\s*$", re.IGNORECASE)
+    )
     shown.locator("visible=true").first.wait_for()
     if pictures is not None:
         page.screenshot(path=pictures / f"{screen.name}.png")
@@ -148,7 +150,6 @@ def drive(screen: Screen, api: Moonraker, pictures: Path | None) -> Iterator[str
     yield f"{screen.name}: paused, resumed, cancelled"
     if mainsail:
         screen.button("Emergency Stop").click()
-        page.locator(".v-dialog--active button:visible").filter(has_text=_whole("Yes")).first.click()
     else:
         page.locator("header button:visible").first.click()
     until(lambda: api.state() == "shutdown", "shutdown")
