@@ -118,7 +118,7 @@ def drive(screen: Screen, api: Moonraker, pictures: Path | None) -> Iterator[str
         screen.button("+10").click()
     else:
         screen.button("10").click()
-        page.locator("button.px-2:visible").nth(5).click()  # right of the home button
+        page.locator("button.px-2:visible").nth(5).click()  # right of the home button; the X axis
     until(lambda: abs(_field(api, "toolhead", "position")[0] - before_mm - 10.0) < 1e-3, "a jog by 10 mm")
     yield f"{screen.name}: homed, jogged"
     target = page.locator("tr:visible", has_text="Heater Bed").locator("input:visible").first
@@ -126,18 +126,55 @@ def drive(screen: Screen, api: Moonraker, pictures: Path | None) -> Iterator[str
     target.press("Enter")
     until(lambda: _field(api, "heater_bed", "target") == TARGET_C, "the bed's target")
     yield f"{screen.name}: bed set to {TARGET_C} °C"
-    page.get_by_text(JOB_NAME).locator("visible=true").first.click(button="right")
+    _print_from_list(screen)
+    until(lambda: api.print_state() == "printing", "printing")
+    until(lambda: _field(api, "print_stats", "print_duration") > 1.0, "the first extrusion")
+    shown = page.get_by_text(
+        re.compile(r"^\s*\d+% Printing\s*$" if mainsail else r"^\s*Printing\s*$", re.IGNORECASE)
+    )
+    shown.locator("visible=true").first.wait_for()
+    if pictures is not None:
+        page.screenshot(path=pictures / f"{screen.name}.png")
+    yield f"{screen.name}: printed from the file list"
+    _job_button(screen, "Pause", "warning").click()
+    until(lambda: api.print_state() == "paused", "paused")
+    _job_button(screen, "Resume", "success").click()
+    until(lambda: api.print_state() == "printing", "printing again")
+    if mainsail:  # its button for cancelling is there only while the job is paused
+        _job_button(screen, "Pause", "warning").click()
+        until(lambda: api.print_state() == "paused", "paused again")
+    _job_button(screen, "Cancel", "error").click()
+    if not mainsail:
+        page.locator(".v-dialog--active button:visible").filter(has_text=_whole("Yes")).first.click()
+    until(lambda: api.print_state() == "cancelled", "cancelled")
+    yield f"{screen.name}: paused, resumed, cancelled"
+    if mainsail:
+        screen.button("Emergency Stop").click()
+    else:
+        page.locator("header button:visible").first.click()
+    until(lambda: api.state() == "shutdown", "shutdown")
+    screen.button("Firmware Restart").click()
+    until(lambda: api.state() == "ready", "ready after the stop")
+    yield f"{screen.name}: stopped at once, restarted"
+    screen.close()
+    yield f"{screen.name}: no page error, no 'too old' notice"
+
+
+def _print_from_list(screen: Screen) -> None:
+    page, mainsail = screen.page, screen.name == "mainsail"
+    if mainsail:
+        job = page.get_by_text(JOB_NAME).locator("visible=true").first
+    else:  # the row of the list has a size; that of the history has none
+        job = page.locator("tr:visible", has_text=re.compile(re.escape(JOB_NAME) + ".*kB", re.DOTALL)).first
+    job.click(button="right")
     entry = _whole("Print start" if mainsail else "Print")
     page.locator(".v-list:visible").get_by_text(entry).locator("visible=true").first.click()
     if mainsail:  # it asks again
         page.locator(".v-dialog--active button:visible").filter(has_text=_whole("Print")).first.click()
-    until(lambda: api.print_state() == "printing", "printing")
-    until(lambda: _field(api, "print_stats", "print_duration") > 1.0, "the first extrusion")
-    page.get_by_text(_whole("Printing")).locator("visible=true").first.wait_for()
-    if pictures is not None:
-        page.screenshot(path=pictures / f"{screen.name}.png")
-    yield f"{screen.name}: printed from the file list"
-    api.ask("/printer/print/cancel", post=True)
-    until(lambda: api.print_state() == "cancelled", "cancelled")
-    screen.close()
-    yield f"{screen.name}: no page error, no 'too old' notice"
+
+
+def _job_button(screen: Screen, label: str, colour: str) -> Locator:
+    """Return a button of the job: Fluidd's have a LABEL, Mainsail's only an icon in a COLOUR."""
+    if screen.name == "mainsail":
+        return screen.page.locator(f".v-card .v-toolbar button.{colour}--text:visible").first
+    return screen.button(label)
