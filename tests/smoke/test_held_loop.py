@@ -44,8 +44,8 @@ def estop(path: Path) -> Iterator[Callable[[], None]]:
 
 def cut_off(held: HeldService) -> None:
     """A signal stops a machine that moves."""
-    moves = "G1 X20 F3000\nG1 X180\n" * 50
-    (held.folder / "long.gcode").write_text(f"SET_KINEMATIC_POSITION X=100 Y=100 Z=10\n{moves}", encoding="ascii")
+    lines = "SET_KINEMATIC_POSITION X=100 Y=100 Z=10\n" + "G1 X20 F3000\nG1 X180\n" * 50
+    (held.folder / "long.gcode").write_text(lines, encoding="ascii")
     with BlockingClient(str(held.socket)) as client:
         client.call("job.start", {"file": "long.gcode"})
         held.wait_for(lambda: held.service.moves, "it moves")
