@@ -51,9 +51,10 @@ class StopPath:
         if machine is None or machine is self._stopped or machine.stopped is not None:
             return
         self._stopped = machine
+        # First: what the nodes report of their stop must not come to the loop before the cause.
+        machine.announced_stop = then
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            # First: what the nodes say of their stop must not come to the loop before the cause.
-            self._loop.call_soon_threadsafe(then)
+            self._loop.call_soon_threadsafe(machine.stop_as_announced)
         machine.stop_nodes()
 
     def _while_held(self) -> None:

@@ -124,6 +124,8 @@ class Machine:
         self.stepper_positions = StepperPositions(description)
         self.nodes: dict[str, Node] = {}
         self.stopped: MachineStopped | None = None
+        self.announced_stop: Callable[[], None] | None = None
+        """Set by another thread that stops the nodes: what the loop does before they report that to it."""
         self.runner: Runner | None = None
         """The service that runs it; None: a program is all there is."""
         self.filament = FilamentForecast()
@@ -208,6 +210,12 @@ class Machine:
         for opened in tuple(self._open):
             with contextlib.suppress(CanductorError):  # the other buses must not miss it
                 opened.bus.emergency_stop()
+
+    def stop_as_announced(self) -> None:
+        """Do what was announced, unless that was done."""
+        announced, self.announced_stop = self.announced_stop, None
+        if announced is not None:
+            announced()
 
     async def sleep(self, name: str) -> None:
         """Disconnect node NAME, so that its power can be switched off; it is not missed until ``wake``.
@@ -403,6 +411,7 @@ class Machine:
         gone = node.state in (NodeState.LOST, NodeState.SHUTDOWN)
         if not self._ready or not gone or node in self._waking:
             return
+        self.stop_as_announced()
         if self.policies[node.name] is not NodePolicy.FATAL and self.stopped is None:
             self._recovery.start(node)
             return
