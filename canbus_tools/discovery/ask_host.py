@@ -30,12 +30,12 @@ async def ask_hosts(options: BusOptions, timeout_s: float = TIMEOUT_S) -> dict[i
     """
     answers = await asyncio.gather(*(_ask(path, timeout_s) for path in host_sockets()))
     bus = _bus_name(options)
-    told: dict[int, NodeInfo] = {}
+    infos: dict[int, NodeInfo] = {}
     for node in (node for nodes in answers for node in nodes if isinstance(node, Mapping)):
         nodeid = node.get("nodeid")
         if node.get("bus") == bus and isinstance(nodeid, int):
-            told[nodeid] = _facts(node)
-    return told
+            infos[nodeid] = _facts(node)
+    return infos
 
 
 def _bus_name(options: BusOptions) -> str:

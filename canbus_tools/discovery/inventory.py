@@ -68,7 +68,7 @@ class InventoryEntry:
     facts: NodeInfo | None = None
     twins: bool = False
     """Another board has the same uuid."""
-    told: NodeInfo | None = None
+    reported: NodeInfo | None = None
     """Of a node in use: what its coordinator reports."""
     passive: NodeInfo | None = None
     """Of a node in use: what its traffic shows, by a dictionary in the cache that explains it."""
@@ -127,11 +127,11 @@ async def take_full_inventory(
     end = bus.on_frame(passive.frame)
     try:
         found = await take_inventory(bus, probed=probed, listen_s=listen_s)
-        told = await ask_hosts(bus.options)
-        await _listen_out(bus, frozenset(bus.hosted - told.keys()), passive)
+        reported = await ask_hosts(bus.options)
+        await _listen_out(bus, frozenset(bus.hosted - reported.keys()), passive)
     finally:
         end()
-    entries = [_in_use(entry, told, passive) for entry in found.entries]
+    entries = [_in_use(entry, reported, passive) for entry in found.entries]
     return replace(found, entries=_mark_twins(entries))
 
 
@@ -143,11 +143,13 @@ async def _listen_out(bus: BusTalk, hosted: Iterable[int], passive: PassiveDisco
         await bus.wait(HEAR_OUT_S)
 
 
-def _in_use(entry: InventoryEntry, told: Mapping[int, NodeInfo], passive: PassiveDiscovery) -> InventoryEntry:
+def _in_use(
+    entry: InventoryEntry, reported: Mapping[int, NodeInfo], passive: PassiveDiscovery
+) -> InventoryEntry:
     if entry.state is not NodePresence.IN_USE or entry.nodeid is None:
         return entry
-    if said := told.get(entry.nodeid):
-        return replace(entry, told=said, uuid=entry.uuid or said.uuid)
+    if info := reported.get(entry.nodeid):
+        return replace(entry, reported=info, uuid=entry.uuid or info.uuid)
     facts = passive.facts(entry.nodeid)
     uuid = entry.uuid or (facts.uuid if facts else None)
     return replace(entry, passive=facts, uuid=uuid)

@@ -119,7 +119,7 @@ class NodesReport:
 
 def entry_json(entry: InventoryEntry) -> dict[str, object]:
     """Return one node with all that is known of it."""
-    facts = entry.facts or entry.told or entry.passive
+    facts = entry.facts or entry.reported or entry.passive
     return {
         "nodeid": entry.nodeid,
         "uuid": None if entry.uuid is None else str(entry.uuid),
@@ -127,7 +127,7 @@ def entry_json(entry: InventoryEntry) -> dict[str, object]:
         "state": entry.state.value,
         "several_boards": entry.twins,
         "trouble": entry.trouble or None,
-        "told_by_host": entry.told is not None,
+        "reported_by_host": entry.reported is not None,
         "guessed": entry.passive is not None,
         "firmware": None if facts is None else asdict(facts.firmware),
         "uptime_s": None if facts is None else facts.uptime_s,
@@ -144,7 +144,7 @@ def _row(entry: InventoryEntry) -> list[str]:
         NAMES[entry.application],
         STATES[entry.state] + (", two boards!" if entry.twins else ""),
     ]
-    facts = entry.facts or entry.told or entry.passive
+    facts = entry.facts or entry.reported or entry.passive
     if facts is None:
         return row + [""] * (len(HEADINGS) - len(row))
     firmware, can = facts.firmware, facts.can

@@ -47,7 +47,7 @@ PINNED: Final = frozenset({"mcu_phase_offset", "phase_offset_position", "tempera
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """The names of one group, by what becomes of them here."""
+    """The names of one group, by what this project does with them."""
 
     group: str
     acting: tuple[str, ...]
@@ -205,7 +205,7 @@ def name_tables(data: Path, page: str, macros: str) -> str:
 
 
 def verdict_table(folder: Path) -> str:
-    """Return what becomes of each configuration in FOLDER (``config/real``)."""
+    """Return the verdict on each configuration in FOLDER (``config/real``)."""
     lines = ["## Configurations one by one", "", "| configuration | the peer | canductor |", "|---|---|---|"]
     lines += [f"| {name} | {peer} | {ours} |" for name, peer, ours in _verdicts(folder)]
     return "\n".join(lines) + "\n"

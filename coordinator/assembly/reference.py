@@ -48,8 +48,8 @@ def sections() -> list[str]:
 
 
 def _module_sections() -> dict[str, SectionSpec]:
-    beside = {f"{title}, further options": module.SPEC for title, module in own_option_readers()}
-    return beside | {title: module.SPEC for title, module in own_modules()}
+    further = {f"{title}, further options": module.SPEC for title, module in own_option_readers()}
+    return further | {title: module.SPEC for title, module in own_modules()}
 
 
 def reference_spec(title: str) -> SectionSpec:
@@ -119,9 +119,9 @@ def with_tables(page: str) -> str:
     head, _, rest = page.partition(_BEGIN)
     mark, _, rest = rest.partition("\n")
     _, _, rest = rest.partition(_END)
-    told = rest[: rest.index("\n`")]
+    notes = rest[: rest.index("\n`")]
     tables = "\n".join(section_table(title) for title in sections())
-    return f"{head}{_BEGIN}{mark}\n\n{tables}\n{_END}{told}\n{unsupported_sections()}"
+    return f"{head}{_BEGIN}{mark}\n\n{tables}\n{_END}{notes}\n{unsupported_sections()}"
 
 
 def main() -> None:

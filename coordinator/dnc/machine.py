@@ -82,10 +82,9 @@ class MachineSink:
 
     def wait_until_over(self) -> Mapping[str, Any]:
         """Return how the job ended, once it has; raises CanductorError unless it was done."""
-        told = _result(self._job)
-        if told["state"] != "done":
-            raise CanductorError(told["message"] or f"{self.name} was {told['state']} at the machine")
-        result: Mapping[str, Any] = told
+        result: Mapping[str, Any] = _result(self._job)
+        if result["state"] != "done":
+            raise CanductorError(result["message"] or f"{self.name} was {result['state']} at the machine")
         return result
 
     # ------------------------------------------------------------------------------------------- calls
@@ -121,13 +120,12 @@ class MachineSink:
     def _check_job(self) -> None:
         """Raise FileRefused if the job is over already."""
         if self._job.done():
-            told = None
             try:
-                told = _result(self._job)
+                result = _result(self._job)
             except CanductorError as error:
                 raise _refused(str(error)) from None
-            message = told["message"]
-            raise _refused(message or f"{self.name} was {told['state']} at the machine")
+            message = result["message"]
+            raise _refused(message or f"{self.name} was {result['state']} at the machine")
 
 
 def _refused(sentence: str) -> FileRefused:

@@ -91,7 +91,7 @@ def test_a_table_is_kept_on_the_nodes_and_in_use(tmp_path: Path) -> None:
         for one in told["downloads"]:
             assert one["broadcasts"] == 1
             assert one["elapsed_s"] > one["bound_s"] > 0
-            assert "of which one takes at least" in one["told"]
+            assert "of which one takes at least" in one["summary"]
         assert {(s["direction"], s["axle"], s["status"], s["active"]) for s in axis["nodes"]} == {
             ("forward", 1, "ok", True),
             ("reverse", 2, "ok", True),

@@ -222,7 +222,7 @@ def _answer(result: Any, lines: list[str], downloads: Sequence[Mapping[str, Any]
             lines.append(f"  {_side(side)}")
     for one in downloads:
         axles = ", ".join(map(str, one["axles"]))
-        lines.append(f"  to {'axle' if len(one['axles']) == 1 else 'axles'} {axles}: {one['told']}")
+        lines.append(f"  to {'axle' if len(one['axles']) == 1 else 'axles'} {axles}: {one['summary']}")
     if not result["axes"]:
         lines.append("no axis of this machine can have a table; add [axis_tables] to its configuration")
     return PlainReport({"result": result}, "\n".join(lines), ok=not problems)

@@ -25,7 +25,7 @@ _DOWNLOADS: Final = Param(
     "downloads",
     Kind.LIST,
     "what was sent to nodes; maps: axles, words, broadcasts, elapsed_s, bound_s (what one broadcast takes at "
-    "least, within its share of the bus and what others leave), told (a sentence)",
+    "least, within its share of the bus and what others leave), summary (a sentence)",
 )
 
 
@@ -40,11 +40,11 @@ class _Tables:
         try:
             columns = {name: _numbers(name, params[name]) for name in ("positions", "forward", "reverse")}
             table = AxisTable(axis=params["axis"].lower(), unit=Unit(params["unit"]), **columns)
-            told, cost = await self._service.tables.send(table, machine, stands=self._service.stands)
+            notes, cost = await self._service.tables.send(table, machine, stands=self._service.stands)
         except TableError as error:
             raise ApiError("bad_params", str(error)) from None
         self._service.log.add("notice", f"{caller.name} sent a table for axis {table.axis}")
-        return {"notes": list(told), "downloads": _downloads(cost), **self._status([table.axis])}
+        return {"notes": list(notes), "downloads": _downloads(cost), **self._status([table.axis])}
 
     async def remove(self, caller: Caller, params: dict[str, Any]) -> Value:
         machine = self._idle_machine()
@@ -113,7 +113,7 @@ def _downloads(reports: Sequence[DownloadReport]) -> list[dict[str, Any]]:
             "broadcasts": sum(cast.times for cast in report.casts),
             "elapsed_s": round(report.elapsed_s, 6),
             "bound_s": round(report.bound_s, 6),
-            "told": report.text(),
+            "summary": report.text(),
         }
         for report in reports
     ]

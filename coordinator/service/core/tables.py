@@ -106,14 +106,14 @@ class TableService:
 
         TableError when it cannot be accepted.
         """
-        told = self._check(table, machine)
+        notes = self._check(table, machine)
         if self._store is not None:
             await asyncio.to_thread(self._store.save, table)
         self._tables[table.axis] = table
         self._changed(table.axis, table)
         reports = await self.bring(machine, [table.axis])
         await self.put_to_use(machine, stands)
-        return told, reports
+        return notes, reports
 
     async def remove(
         self, axis: str, machine: Machine, *, stands: Callable[[], bool]
@@ -288,12 +288,12 @@ class TableService:
         table = self._tables.get(axis)
         nodes = [
             {"stepper": place.stepper, "node": place.node, "direction": str(direction), "axle": side.axle}
-            | (self._at[side].told() if side in self._at else {"status": _unknown(place)})
+            | (self._at[side].status() if side in self._at else {"status": _unknown(place)})
             for place in places
             for direction, side in place.sides.items()
         ]
-        told = None if table is None else figures(table)
-        return {"axis": axis, "table": told, "nodes": nodes, **self._correction(axis)}
+        summary = None if table is None else figures(table)
+        return {"axis": axis, "table": summary, "nodes": nodes, **self._correction(axis)}
 
     def _show(self, machine: Machine) -> None:
         for found in self.status(machine):
@@ -371,7 +371,7 @@ class _Side:
         except CanductorError as error:
             self.problem = str(error)
 
-    def told(self) -> dict[str, Any]:
+    def status(self) -> dict[str, Any]:
         """Return it for front ends."""
         if self._state is None:
             return {"status": "not known", "problem": self.problem}

@@ -86,12 +86,12 @@ class Typed:
                 continue
             try:
                 params = self._run.check({"script": line, "wait": False})
-                told = await self._run.call(Caller("the terminal", Scope.OPERATE), params)  # type: ignore[misc]
+                output = await self._run.call(Caller("the terminal", Scope.OPERATE), params)  # type: ignore[misc]
             except CanductorError as error:
                 self._say(str(error))
                 continue
-            assert isinstance(told, dict)
-            for reply in told["replies"]:
+            assert isinstance(output, dict)
+            for reply in output["replies"]:
                 self._say(reply)
 
 

@@ -178,9 +178,9 @@ def _why_none(name: str, job: JobRun | None) -> str:
     """Return why the job NAME takes no more lines."""
     if job is None or job.file != name or _takes_lines(job):
         return f"there is no job {name} that is fed; job.stream begins one"
-    told = {
+    reasons = {
         JobPhase.DONE: f"{name} has ended",
         JobPhase.FAILED: job.message,
         JobPhase.STOPPED: f"{name}: the machine stopped: {job.message}",
     }
-    return told.get(job.phase, f"{name} was cancelled at the machine")
+    return reasons.get(job.phase, f"{name} was cancelled at the machine")

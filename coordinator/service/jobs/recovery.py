@@ -345,9 +345,9 @@ def _hot(modules: "Modules") -> Mapping[str, Any]:
     status = modules.status()
     heaters: dict[str, float] = {}
     fans: dict[str, float] = {}
-    for name, told in status.items():
+    for name, fields in status.items():
         kind, _, instance = name.partition(" ")
-        target, speed = told.get("target"), told.get("speed")
+        target, speed = fields.get("target"), fields.get("speed")
         if kind.startswith(("extruder", "heater_")) and isinstance(target, int | float) and target > 0:
             heaters[instance or kind] = round(float(target), 3)
         elif kind in ("fan", "fan_generic") and isinstance(speed, int | float):
