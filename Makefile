@@ -19,8 +19,19 @@ $(VENV)/.python: pyproject.toml .ci/prerequisites
 	$(BIN)/pip install -q --disable-pip-version-check 'setuptools>=77' 'cffi>=2.0'
 	@touch $@
 
-$(VENV)/.installed: $(VENV)/.python $(NATIVE_INPUTS)
-	$(BIN)/pip install -q --disable-pip-version-check --no-build-isolation -e '.[dev]'
+$(VENV)/.dependencies: $(VENV)/.python .ci/requirements
+	$(BIN)/python .ci/requirements dev >$(VENV)/requirements.txt
+	$(BIN)/pip install -q --disable-pip-version-check -r $(VENV)/requirements.txt
+	@touch $@
+
+$(VENV)/.compiled: $(VENV)/.python $(NATIVE_INPUTS)
+	$(BIN)/python setup.py -q build_ext --inplace
+	@touch $@
+
+# The C code is compiled while pip fetches packages.
+$(VENV)/.installed: $(VENV)/.python .ci/requirements $(NATIVE_INPUTS)
+	@$(MAKE) -j2 --no-print-directory $(VENV)/.dependencies $(VENV)/.compiled
+	$(BIN)/pip install -q --disable-pip-version-check --no-build-isolation --no-deps -e .
 	# As an installation that is not editable does; some environments forbid Python to do it later.
 	@$(BIN)/python -m compileall -q coordinator nodes canbus_tools
 	@touch $@

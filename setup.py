@@ -58,13 +58,15 @@ class BuildNative(build_ext):
     """Compiles the firmware of virtual nodes with the extension modules, on all cores."""
 
     def finalize_options(self) -> None:
+        if self.inplace or self.editable_mode:  # one folder for both: what is compiled already stays
+            self.build_temp = self.build_lib = str(ROOT / "build" / "native")
         super().finalize_options()
         self.parallel = self.parallel or True  # as many as there are cores
 
     def run(self) -> None:
         super().run()
-        inplace = self.inplace or self.editable_mode
-        bin_dir = (ROOT if inplace else Path(self.build_lib).absolute()) / "nodes" / "virtual" / "bin"
+        in_place = self.inplace or self.editable_mode
+        bin_dir = (ROOT if in_place else Path(self.build_lib).absolute()) / "nodes" / "virtual" / "bin"
         options = [f"BIN_DIR={bin_dir}", f"PYTHON={sys.executable}"]
         subprocess.run(
             ["make", f"-j{os.cpu_count()}", "-C", str(ROOT / "firmware"), "linux", *options], check=True
