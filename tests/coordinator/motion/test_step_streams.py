@@ -100,7 +100,7 @@ def test_clock_error_stays_below_a_tenth_of_a_tick_for_ten_hours() -> None:
         assert math.floor(exact - tenth) <= run.gen.clock_at(0, t) <= math.floor(exact + tenth)
 
 
-@pytest.mark.parametrize("move_count", [1, 2, 3, 16])
+@pytest.mark.parametrize("move_count", [1, 3, 16])
 def test_queue_slots_never_overflow(move_count: int) -> None:
     moves, t, at = [], 1.0, ORIGIN
     rng = np.random.default_rng(move_count)

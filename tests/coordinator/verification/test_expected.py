@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from coordinator.verification.exact_signal import TRAPEZOID
-from coordinator.verification.expected import expected_steps
+from coordinator.verification.expected import Floats, expected_steps
 
 
 def trapezoid(
@@ -27,18 +27,18 @@ def trapezoid(
     return np.array([row], dtype=TRAPEZOID)[0]
 
 
-def position(move: np.void, t: float) -> float:
-    """Return the way along MOVE, t seconds after its begin."""
+def distances(move: np.void, times: Floats) -> Floats:
+    """Return the distances along MOVE at TIMES, in s after its begin."""
     phases = (
         (move["accel_s"], move["start_v"], move["accel"]),
         (move["cruise_s"], move["cruise_v"], 0.0),
         (move["decel_s"], move["cruise_v"], -move["accel"]),
     )
-    way = 0.0
+    way, left = np.zeros(len(times)), times
     for duration, velocity, accel in phases:
-        now = min(max(t, 0.0), float(duration))
-        way += float(velocity * now + accel * now * now / 2)
-        t -= float(duration)
+        now = np.clip(left, 0.0, duration)
+        way += velocity * now + accel * now * now / 2
+        left = left - duration
     return way
 
 
@@ -56,14 +56,15 @@ def test_agrees_with_fine_sampling(weights: tuple[float, float, float, float]) -
     standing = 0
     for move in moves:
         duration = float(move["accel_s"] + move["cruise_s"] + move["decel_s"])
-        for t in np.linspace(0, duration, 20_000):
-            point = move["start"] + move["ratio"] * position(move, float(t))
-            now = int(np.floor(float(point @ np.array(weights)) / step + 0.5))
-            if now != standing:
-                assert abs(now - standing) == 1
-                seen_times.append(float(move["print_time"]) + t)
-                seen_directions.append(now - standing)
-                standing = now
+        times = np.linspace(0, duration, 20_000)
+        points = move["start"] + np.outer(distances(move, times), move["ratio"])
+        steps = np.floor(points @ np.array(weights) / step + 0.5).astype(int)
+        changes = np.diff(steps, prepend=standing)
+        changed = changes != 0
+        assert (abs(changes[changed]) == 1).all()
+        seen_times.extend(float(move["print_time"]) + times[changed])
+        seen_directions.extend(changes[changed].tolist())
+        standing = int(steps[-1])
     chunks = list(expected_steps(np.array(moves, dtype=TRAPEZOID), weights, step, origin=0.0))
     times = np.concatenate([c.print_time for c in chunks])
     directions = np.concatenate([c.direction for c in chunks])
