@@ -17,6 +17,7 @@ READ_BY = {
     "canbus_tools/monitor/text.py": "how long ago a recorded node was heard",
     "coordinator/front_ends/log_file.py": "times of lines, for people",
     "coordinator/service/api/machine.py": "when the service began, for people",
+    "coordinator/service/core/machine_service.py": "when a job ended, for the history of jobs",
     "coordinator/service/state/log_ring.py": "time of a line of the log",
     "coordinator/web/server.py": "age of sessions, which outlive the process",
     "nodes/virtual/python_can.py": "times of frames, as python-can has them",

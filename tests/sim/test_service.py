@@ -184,3 +184,44 @@ def test_progress_is_at_the_line_that_waits(tmp_path: Path) -> None:
         assert seen[last] > 3.5
 
     world.serve(go)
+
+
+def test_what_a_page_shows_of_jobs(tmp_path: Path) -> None:
+    """What a program waits for, the picture, the macros; and the history, also in the next service."""
+    macro = "[gcode_macro WAVE]\ndescription: Wave the head\ngcode: G4 P1\n"
+    world = DemoMachine(tmp_path, sections=macro)
+    picture = "; thumbnail begin 8x8 12\n; iVBORw0KGgo=\n; thumbnail end\n"
+
+    async def waits(stage: Served, line: str, low: float | None, high: float | None) -> None:
+        assert world_waits(stage) is None
+        stage.write_job(f"{line}\n")
+        await stage.call("job.start", file="job.gcode")
+        await stage.until(lambda: world_waits(stage) is not None, line)
+        assert world_waits(stage) == {"name": "heater_bed", "minimum": low, "maximum": high}
+        await stage.call("machine.emergency_stop")
+        await stage.call("machine.restart")
+        await stage.until_state("ready")
+
+    def world_waits(stage: Served) -> object:
+        assert stage.service.machine is not None
+        return stage.service.machine.modules.status()["heaters"]["waiting_for"]
+
+    async def go() -> None:
+        async with running(Served(tmp_path, lambda: world.description, world.host)) as stage:
+            assert await stage.call("gcode.macros") == {"macros": [{"name": "WAVE", "help": "Wave the head"}]}
+            stage.write_job(f"{picture}G4 P100\n")
+            shown = await stage.call("job.thumbnail", file="job.gcode")
+            assert shown == {"width": 8, "height": 8, "png": "iVBORw0KGgo="}
+            assert (await stage.call("job.thumbnail", file="job.gcode", pixels_max=7))["png"] is None
+            await stage.call("job.start", file="job.gcode")
+            await stage.until_job("done")
+            await waits(stage, "M190 S60", 60.0, 60.0)
+            await waits(stage, "TEMPERATURE_WAIT SENSOR=heater_bed MINIMUM=40", 40.0, None)
+        async with running(Served(tmp_path, lambda: world.description, world.host)) as stage:
+            *stopped, done = (await stage.call("job.history"))["jobs"]
+        assert [job["state"] for job in stopped] == ["stopped", "stopped"]
+        assert stopped[0]["message"].startswith("emergency stop by")
+        assert (done["file"], done["state"], done["message"]) == ("job.gcode", "done", "")
+        assert done["elapsed_s"] >= 0.1
+
+    world.run(go)

@@ -1,6 +1,8 @@
 """What all heaters and sensors have in common: their names, and the commands for any of them."""
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
+from math import isinf
 from typing import Final
 
 from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading, Synchronized
@@ -28,6 +30,7 @@ class HeaterRegistry(Module):
         self.sensors: dict[str, TemperatureSource] = {}
         """By the name in programs: heaters and the sections of sensors."""
         self._tags: dict[str, Heater | TemperatureSource] = {}
+        self._waiting_for: Value = None
         for name, help_, read in (
             ("M105", "Report all temperatures", self._report),
             ("TURN_OFF_HEATERS", "Turn all heaters off", self._turn_off),
@@ -74,7 +77,21 @@ class HeaterRegistry(Module):
             "available_sensors": list(self.sensors),
             "available_monitors": [],
             "calibrated": calibrated,
+            "waiting_for": self._waiting_for,
         }
+
+    @contextmanager
+    def _waits(self, name: str, low_c: float, high_c: float) -> Iterator[None]:
+        """Report, inside the block, that a command waits for NAME to be between LOW_C and HIGH_C."""
+        limits: dict[str, Value] = {
+            "minimum": None if isinf(low_c) else low_c,
+            "maximum": None if isinf(high_c) else high_c,
+        }
+        self._waiting_for = {"name": name, **limits}
+        try:
+            yield
+        finally:
+            self._waiting_for = None
 
     # ------------------------------------------------------------------------------------------ commands
 
@@ -101,7 +118,8 @@ class HeaterRegistry(Module):
         async def perform() -> Done | None:
             unit.set_target(celsius)
             if celsius > 0:
-                await unit.reach()
+                with self._waits(unit.key, celsius, celsius):
+                    await unit.reach()
             return Done((self.temperatures(),), kind=ReplyKind.PLAIN)
 
         return AtStandstill(perform)
@@ -144,9 +162,10 @@ class HeaterRegistry(Module):
             )
 
         async def perform() -> None:
-            await source.next()
-            while source.celsius is None or not (source.is_sound and low <= source.celsius <= high):
+            with self._waits(given["SENSOR"], low, high):
                 await source.next()
+                while source.celsius is None or not (source.is_sound and low <= source.celsius <= high):
+                    await source.next()
 
         return AtStandstill(perform)
 

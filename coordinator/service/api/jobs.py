@@ -1,15 +1,19 @@
 """Methods about jobs: files of the job folder, one at a time."""
 
 import asyncio
+from base64 import b64encode
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any, Final
 
 from coordinator.gcode.commands import Recovering
+from coordinator.gcode.thumbnail import HEAD_BYTES, thumbnails
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.motion import MotionOver
 from coordinator.service.core.work import FileWork
 from coordinator.service.jobs.fed import FAILURE_MAX, NAME_MAX, PIECE_BYTES_MAX, PIECE_LINES_MAX
+from coordinator.service.jobs.history import HISTORY_MAX
 from coordinator.service.jobs.job_folder import FILES_MAX, JobFolder, NoSuchJob
 from coordinator.service.jobs.jobs import JobPhase, JobRun
 from coordinator.service.state.figures import job_figures
@@ -101,6 +105,21 @@ class _Jobs:
 
     def status(self, _caller: Caller, _params: dict[str, Any]) -> Value:
         return self._status()
+
+    def history(self, _caller: Caller, _params: dict[str, Any]) -> Value:
+        return {"jobs": [asdict(job) for job in self._service.history.jobs]}
+
+    async def thumbnail(self, _caller: Caller, params: dict[str, Any]) -> Value:
+        folder, most = self._folder(), params["pixels_max"]
+        try:
+            head = await asyncio.to_thread(folder.head, params["file"], HEAD_BYTES)
+        except NoSuchJob as error:
+            raise ApiError("no_such_file", str(error)) from None
+        fitting = [picture for picture in thumbnails(head) if max(picture.width, picture.height) <= most]
+        if not fitting:
+            return {"width": None, "height": None, "png": None}
+        best = fitting[-1]
+        return {"width": best.width, "height": best.height, "png": b64encode(best.png).decode()}
 
     def _folder(self) -> JobFolder:
         if self._service.folder is None:
@@ -194,6 +213,37 @@ def job_methods(service: MachineService) -> Iterator[Method]:
             ),
         ),
         returns=_JOB,
+    )
+    yield Method(
+        "job.history",
+        Scope.WATCH,
+        f"Return the last {HISTORY_MAX} jobs that ended, the newest first.",
+        jobs.history,
+        returns=(
+            Param(
+                "jobs",
+                Kind.LIST,
+                "maps of file, state (done, cancelled, failed, stopped), message (why), ended_s (since the"
+                " epoch), elapsed_s (with pauses), print_time_s (without), filament_mm (drawn in)",
+            ),
+        ),
+    )
+    yield Method(
+        "job.thumbnail",
+        Scope.WATCH,
+        "Return the largest picture that fits from the comments a slicer wrote at the begin of a file.",
+        jobs.thumbnail,
+        params=(
+            Param("file", Kind.STR, "as job.list names it", high=PATH_BYTES_MAX),
+            Param(
+                "pixels_max", Kind.INT, "of its longer side", required=False, default=300, low=1, high=9999
+            ),
+        ),
+        returns=(
+            Param("width", Kind.INT, "null: the file has no picture that fits", "pixels"),
+            Param("height", Kind.INT, "likewise", "pixels"),
+            Param("png", Kind.STR, "in base64; null likewise"),
+        ),
     )
     yield Method(
         "job.status", Scope.WATCH, "Return the progress of the job, or its result.", jobs.status, returns=_JOB

@@ -11,6 +11,7 @@ from coordinator.gcode.builtins.machine import is_tool
 from coordinator.gcode.errors import GCodeError
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
 from coordinator.modules.module_set import INTERRUPTING
+from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.feeder import FeederFull, QueuedWork
 from coordinator.service.core.machine_service import MachineService, ServiceState
@@ -139,6 +140,12 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         work = LinesWork([f"G28 {' '.join(named)}"], name="move.home")
         return _answer((await _done(service, service.ready_motion(), work)).output)
 
+    def macros(_caller: Caller, _params: dict[str, Any]) -> Value:
+        modules = service.up_machine().modules
+        help_ = modules.command_help
+        names = sorted(macro.command for macro in modules.of(GCodeMacro))
+        return {"macros": [{"name": name, "help": help_.get(name, "")} for name in names]}
+
     async def position(_caller: Caller, params: dict[str, Any]) -> Value:
         motion = service.ready_motion()
         await motion.begun.wait()
@@ -160,6 +167,13 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         params=(Param("script", Kind.STR, "lines", high=LINES_BYTES_MAX), _WAIT),
         returns=_TOLD,
         stops=_who_stops,
+    )
+    yield Method(
+        "gcode.macros",
+        Scope.WATCH,
+        "List the machine's macros ([gcode_macro]) by name.",
+        macros,
+        returns=(Param("macros", Kind.LIST, "maps of name and help"),),
     )
     for name, call, sentence in (
         ("move.to", move_to, "Move straight to a place in the machine's frame, whatever g-code modes hold."),

@@ -6,6 +6,7 @@ One object owns it. All of it runs on the control loop; clients' methods only ch
 import asyncio
 import contextlib
 import secrets
+import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -27,8 +28,10 @@ from coordinator.service.core.programs import Programs
 from coordinator.service.core.tables import TableService
 from coordinator.service.core.work import FileWork
 from coordinator.service.jobs.fed import FedJobs
+from coordinator.service.jobs.history import EndedJob, JobHistory
 from coordinator.service.jobs.job_folder import JobFolder, JobFolderClaim
 from coordinator.service.jobs.jobs import JobPhase, JobRun
+from coordinator.service.jobs.journal import journal_path
 from coordinator.service.jobs.outcome import Outcome, job_progress, outcome_of
 from coordinator.service.jobs.recovery import Recovery
 from coordinator.service.state.figures import Figures
@@ -141,6 +144,7 @@ class MachineService:
         self.recovery = Recovery(self, settings.state)
         self.programs = Programs(self, self.recovery)
         self.fed = FedJobs(self)
+        self.history = JobHistory(self._notice)
         self._restart = asyncio.Event()
         self._reset_nodes = False
         """At the next start, whatever their configuration."""
@@ -172,6 +176,7 @@ class MachineService:
             await asyncio.gather(refresh, return_exceptions=True)
             await self._let_go()
             await asyncio.to_thread(self.recovery.close)
+            await self.history.close()
             self._unclaim()
 
     async def run_job(
@@ -264,6 +269,8 @@ class MachineService:
             async with self._stop_on_failure(machine):
                 self.programs.begin(machine)
                 self.recovery.open()
+                if self.folder is not None and self.settings.state is not None:
+                    self.history.open(journal_path(self.settings.state, self.folder.path, "history"))
                 await self._begin_motion(machine, self.look).run()
         finally:
             care.cancel()
@@ -306,7 +313,10 @@ class MachineService:
             return
         cause = str(machine.stopped)
         if self.job is not None:
+            was_active = self.job.active
             self.job.stop(cause, self.now_s)
+            if was_active:
+                self._job_ended(self.job)
             self.fed.look()
         self._enter(ServiceState.SHUTDOWN, cause)
 
@@ -460,8 +470,8 @@ class MachineService:
             job.look(self.now_s)
             if job.phase is not before:
                 self.log.add("job", f"{job.file}: {job.phase}" + (f": {job.message}" if job.message else ""))
-                if not job.active and self.settings.own_process:
-                    give_back()
+                if not job.active:
+                    self._job_ended(job)
         self.fed.look()
         self.programs.look()
         self.recovery.look()
@@ -477,6 +487,22 @@ class MachineService:
         self.tables.show_corrections()
         if self._refresh_rests and self.moves:
             self._reading.set()
+
+    def _job_ended(self, job: JobRun) -> None:
+        assert job.ended_s is not None
+        self.history.add(
+            EndedJob(
+                file=job.file,
+                state=str(job.phase),
+                message=job.message,
+                ended_s=round(time.time(), 3),
+                elapsed_s=round(job.ended_s - job.began_s, 1),
+                print_time_s=round(job.print_time_s, 1),
+                filament_mm=round(job.filament_mm, 1),
+            )
+        )
+        if self.settings.own_process:
+            give_back()
 
     def _enter(self, state: ServiceState, cause: str = "") -> None:
         self.state, self.cause = state, cause

@@ -92,6 +92,18 @@ class JobFolder:
 
     def open(self, name: str) -> Program:
         """Open the file NAME, relative to the folder; raises NoSuchJob."""
+        clean = "/".join(_parts(name))
+        source = UnchangedFile(self._open(name), clean)
+        status = source.status
+        return Program(source, clean, size_bytes=status.st_size, modified_ns=status.st_mtime_ns)
+
+    def head(self, name: str, size_bytes: int) -> bytes:
+        """Return the first SIZE_BYTES of the file NAME; raises NoSuchJob."""
+        with os.fdopen(self._open(name), "rb") as file:
+            return file.read(size_bytes)
+
+    def _open(self, name: str) -> int:
+        """Return a descriptor of the file NAME; raises NoSuchJob."""
         parts = _parts(name)
         try:
             fd = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -111,10 +123,7 @@ class JobFolder:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
             raise NoSuchJob(f"{_shown(name)} in the job folder is not a file")
-        clean = "/".join(parts)
-        source = UnchangedFile(fd, clean)
-        status = source.status
-        return Program(source, clean, size_bytes=status.st_size, modified_ns=status.st_mtime_ns)
+        return fd
 
 
 def _parts(name: str) -> tuple[str, ...]:

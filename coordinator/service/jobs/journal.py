@@ -49,10 +49,10 @@ class Interrupted:
     """Whether its lines came from a client: there is no file to go on with."""
 
 
-def journal_path(state: Path, jobs: Path) -> Path:
-    """Return where the journal of the job folder JOBS is, in the folder STATE."""
+def journal_path(state: Path, jobs: Path, kind: str = "journal") -> Path:
+    """Return where the journal of the job folder JOBS is, in the folder STATE; or another file of KIND."""
     digest = hashlib.sha256(os.fsencode(jobs.absolute())).hexdigest()[:12]
-    return state / f"journal-{digest}"
+    return state / f"{kind}-{digest}"
 
 
 def read_journal(path: Path) -> Interrupted | None:

@@ -260,6 +260,8 @@ def bus_figures(name: str, stats: IOStats) -> dict[str, Value]:
         "frames_received": stats.frames_received,
         "frames_malformed": stats.frames_malformed,
         "frames_dropped": stats.frames_dropped,
+        "bytes_sent": stats.bytes_sent,
+        "bytes_received": stats.bytes_received,
         "send_waits": stats.waits,
         **load_figures(stats.load),
     }

@@ -13,6 +13,10 @@ const CLASSES = [
   ["data", "data received", "c5"],
   ["weak", "others", "c6"],
 ];
+const SERIAL_COUNTERS = [
+  ["bytes_sent", "Bytes sent"],
+  ["bytes_received", "Bytes received"],
+];
 const COUNTERS = [
   ["frames_sent", "Sent"],
   ["frames_received", "Received"],
@@ -39,7 +43,7 @@ class BusCard {
       keys.append(make("li", {}, dot, `${label} `, this.#keys[key]));
     }
     const figures = make("dl", { class: "figures" });
-    for (const [key, label] of COUNTERS) {
+    for (const [key, label] of [...COUNTERS, ...SERIAL_COUNTERS]) {
       this.#figures[key] = make("dd", {}, "–");
       figures.append(make("div", {}, make("dt", {}, label), this.#figures[key]));
     }
@@ -64,9 +68,15 @@ class BusCard {
     this.element.style.order = bitrate ? 0 : 1;
     this.chart.tell(bitrate ? percent(get("load_total"), 1) : "–");
     for (const [key] of CLASSES) put(this.#keys[key], bitrate ? percent(get(`load_${key}`), 1) : "–");
+    const is_serial = !get("frames_received") && get("bytes_received") > 0; // its frames are not counted, its bytes are
     for (const [key, , is_bad] of COUNTERS) {
       put(this.#figures[key], count(get(key)));
       if (is_bad) mark(this.#figures[key], "level", get(key) ? "bad" : "");
+      show(this.#figures[key].parentElement, !is_serial || key === "send_waits");
+    }
+    for (const [key] of SERIAL_COUNTERS) {
+      put(this.#figures[key], count(get(key)));
+      show(this.#figures[key].parentElement, is_serial);
     }
   }
 

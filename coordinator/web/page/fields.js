@@ -18,6 +18,10 @@ export class Fields {
     return this.#values.get(path) ?? otherwise;
   }
 
+  has(path) {
+    return this.#values.has(path);
+  }
+
   /** Return the names directly below PREFIX ("nodes"), sorted. */
   names(prefix) {
     const found = new Set();

@@ -1,20 +1,25 @@
 // Mouse, fingers, wheel and keys on the toolpath.
 
 const KEY_PX = 24;
+const TAP_PX = 5; // a finger that moves less has tapped
 
-export function take_gestures(canvas, camera, redraw) {
+/** ON_TAP gets the place of a click or tap, px from the canvas' corner. */
+export function take_gestures(canvas, camera, redraw, on_tap) {
   const fingers = new Map();
+  let tap = null; // where a single finger came down, until it has moved
   const middle = () => {
     const box = canvas.getBoundingClientRect();
     return [box.left + box.width / 2, box.top + box.height / 2];
   };
   canvas.addEventListener("pointerdown", (event) => {
     fingers.set(event.pointerId, event);
+    tap = fingers.size === 1 ? event : null;
     canvas.setPointerCapture(event.pointerId);
   });
   canvas.addEventListener("pointermove", (event) => {
     const before = fingers.get(event.pointerId);
     if (!before) return;
+    if (tap && Math.hypot(event.clientX - tap.clientX, event.clientY - tap.clientY) > TAP_PX) tap = null;
     if (fingers.size === 1) {
       camera.drag(event.clientX - before.clientX, event.clientY - before.clientY, event.shiftKey || event.buttons === 2);
     } else if (fingers.size === 2) {
@@ -27,7 +32,13 @@ export function take_gestures(canvas, camera, redraw) {
     redraw();
   });
   for (const end of ["pointerup", "pointercancel"]) {
-    canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
+    canvas.addEventListener(end, (event) => {
+      fingers.delete(event.pointerId);
+      if (!tap || end === "pointercancel") return;
+      const box = canvas.getBoundingClientRect();
+      on_tap(event.clientX - box.left, event.clientY - box.top);
+      tap = null;
+    });
   }
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener(

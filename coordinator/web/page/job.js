@@ -1,6 +1,7 @@
-// The job: how far it is, and start, pause, resume, cancel of files of the job folder.
+// The job: how far it is and what it waits for, and start, pause, resume, cancel of files of the job folder.
 
 import { $, count, duration, make, mark, percent, put, show } from "./dom.js";
+import { waits_for } from "./heat.js";
 
 const ACTIVE = new Set(["printing", "pausing", "paused", "cancelling"]);
 const SURE_MS = 4000;
@@ -11,9 +12,20 @@ export class Job {
   #may = false;
   #state = "none";
   #sure = 0; // timer
+  #pictured = ""; // the file whose picture is shown
+  #asked_to_cancel = false;
 
-  constructor(link) {
+  /** HEAT: the temperatures; ON_END is called when a job has ended. */
+  constructor(link, heat, on_end) {
     this.#link = link;
+    this.heat = heat;
+    this.on_end = on_end;
+    $("job-files").addEventListener("change", () => this.#picture($("job-files").value));
+    $("heat-leave").addEventListener("click", () => show($("still-hot"), false));
+    $("heat-end").addEventListener("click", () => {
+      this.heat.turn_off();
+      show($("still-hot"), false);
+    });
     $("job-pause").addEventListener("click", () => this.#call("job.pause"));
     $("job-resume").addEventListener("click", () => this.#call("job.resume"));
     $("job-cancel").addEventListener("click", () => this.#cancel());
@@ -46,6 +58,33 @@ export class Job {
     );
     if (!files.length) select.append(make("option", { value: "" }, "no files in the job folder"));
     if (names.includes(chosen)) select.value = chosen;
+    if (!ACTIVE.has(this.#state)) this.#picture(select.value);
+  }
+
+  /** Show the list with FILE chosen: it has just arrived. */
+  async choose(file) {
+    await this.list();
+    $("job-files").value = file;
+    this.#picture(file);
+  }
+
+  /** Show the slicer's picture of FILE, if it has one. */
+  async #picture(file) {
+    if (file === this.#pictured) return;
+    this.#pictured = file;
+    let found = { png: null };
+    try {
+      if (file) found = await this.#link.call("job.thumbnail", { file });
+    } catch (error) {
+      if (error.code === "offline") this.#pictured = "";
+    }
+    const image = found.png ? await decoded(found.png) : null;
+    if (file !== this.#pictured) return;
+    const canvas = $("job-picture");
+    show(canvas, image !== null);
+    if (!image) return;
+    [canvas.width, canvas.height] = [image.width, image.height];
+    canvas.getContext("2d").drawImage(image, 0, 0);
   }
 
   show(fields, machine_state) {
@@ -53,8 +92,13 @@ export class Job {
     const state = get("state") ?? "none";
     const progress = get("progress") ?? 0;
     const active = ACTIVE.has(state);
+    if (ACTIVE.has(this.#state) && !active) this.#ended(fields, state);
+    if (active && !ACTIVE.has(this.#state)) this.#picture(get("file"));
     this.#state = state;
     put($("job-file"), get("file") ?? "no job yet");
+    const waits = waits_for(fields);
+    show($("job-waits"), waits !== "");
+    put($("job-waits"), waits);
     show($("job-state"), state !== "none");
     put($("job-state"), state);
     mark($("job-state"), "state", state);
@@ -81,6 +125,16 @@ export class Job {
     $("job-print").disabled = !(may && machine_state === "ready" && !ACTIVE.has(state) && $("job-files").value);
   }
 
+  #ended(fields, state) {
+    this.on_end();
+    const hot = this.heat.hot(fields);
+    const ask = this.#asked_to_cancel && state === "cancelled" && hot.length > 0;
+    this.#asked_to_cancel = false;
+    if (!ask) return;
+    put($("still-hot-text"), `The job was cancelled. Still heated: ${hot.join(", ")}.`);
+    show($("still-hot"), true);
+  }
+
   /** Cancel when asked twice: a print is hours. */
   #cancel() {
     const button = $("job-cancel");
@@ -91,6 +145,7 @@ export class Job {
     };
     if (button.dataset.sure === "true") {
       settle();
+      this.#asked_to_cancel = true;
       this.#call("job.cancel");
       return;
     }
@@ -108,6 +163,16 @@ export class Job {
       put(told, error.message);
       show(told, true);
     }
+  }
+}
+
+/** Return the picture PNG, given in base64; null when it is none. */
+async function decoded(png) {
+  const bytes = Uint8Array.from(atob(png), (letter) => letter.charCodeAt(0));
+  try {
+    return await createImageBitmap(new Blob([bytes], { type: "image/png" }));
+  } catch {
+    return null;
   }
 }
 

@@ -4,18 +4,24 @@ import { bus_cards } from "./buses.js";
 import { Console } from "./console.js";
 import { $, duration, figure, mark, percent, put, show } from "./dom.js";
 import { Fields } from "./fields.js";
+import { Heat } from "./heat.js";
+import { History } from "./history.js";
 import { Job } from "./job.js";
 import { Link } from "./link.js";
 import { Login } from "./login.js";
+import { Macros } from "./macros.js";
+import { Move } from "./move.js";
 import { node_cards } from "./nodes.js";
+import { Objects } from "./objects.js";
 import { Path } from "./path.js";
 import { Stop } from "./stop.js";
 import { table_cards } from "./tables.js";
 import { choose_colours } from "./theme.js";
+import { Upload } from "./upload.js";
 import { View } from "./view.js";
 
 const FAST = ["machine.", "job.", "position."];
-const SLOW = ["nodes.", "buses.", "tables."];
+const SLOW = ["nodes.", "buses.", "tables.", "modules."];
 const SAMPLE_MS = 500;
 const HIDDEN_MS = 3000; // a tab that is hidden for so long is told nothing more until it is seen
 
@@ -28,7 +34,13 @@ const stop = new Stop(link);
 const fields = new Fields();
 const path = new Path(link);
 const view = new View(path);
-const job = new Job(link);
+const heat = new Heat(link);
+const history = new History(link);
+const job = new Job(link, heat, () => history.list());
+const move = new Move(link);
+const macros = new Macros(link);
+const objects = new Objects(link, view);
+const upload = new Upload(link, (file) => job.choose(file));
 const terminal = new Console(link);
 const nodes = node_cards();
 const buses = bus_cards();
@@ -46,21 +58,23 @@ link.addEventListener("up", async (event) => {
   login.hide();
   show($("offline"), false);
   mark(document.body, "offline", "false");
-  job.may = terminal.may = may;
+  for (const part of [job, terminal, heat, move, macros, objects, upload]) part.may = may;
   if (!document.hidden) watch();
   try {
     const info = await link.call("machine.info");
     introduce(info);
     await terminal.begin(info.started_s);
     await job.list();
+    await history.list();
+    await macros.list();
   } catch (error) {
-    if (error.code !== "offline") console.warn(error.message);
+    if (error.code !== "offline" && error.code !== "not_ready") console.warn(error.message);
   }
 });
 
 link.addEventListener("down", (event) => {
   down ??= { since: new Date(), reason: event.detail.message };
-  terminal.may = false;
+  terminal.may = upload.may = false;
   show_down();
 });
 
@@ -109,7 +123,11 @@ function redraw() {
     due = false;
     show_machine();
     show_position();
-    job.show(fields, fields.get("machine.state"));
+    const state = fields.get("machine.state");
+    job.show(fields, state);
+    move.show(fields, state);
+    macros.show();
+    objects.show(fields);
   });
 }
 
@@ -158,6 +176,8 @@ function show_down() {
   show($("offline"), true);
   show_machine();
   job.show(fields, null);
+  move.show(fields, null);
+  macros.show();
 }
 
 $("restart").addEventListener("click", async () => {
@@ -179,10 +199,12 @@ setInterval(() => {
     nodes.sample(fields, now_s);
     buses.sample(fields, now_s);
     tables.sample(fields, now_s);
+    heat.sample(fields, now_s);
   }
   nodes.show(fields, now_s);
   buses.show(fields, now_s);
   tables.show(fields, now_s);
+  heat.show(fields, now_s);
 }, SAMPLE_MS);
 
 choose_colours(() => view.colours());

@@ -9,6 +9,7 @@ import { colour } from "./theme.js";
 
 const SHADES = 16; // of height
 const LAYER_MM = 0.02; // in 2D: what is this close to the head's height is its layer
+const OBJECT_MM = 10; // the square of an object that has only a centre
 const SPAN_LEAST_MM = 20; // a part that is just begun is not shown larger than life
 
 export class View {
@@ -24,12 +25,14 @@ export class View {
   #travels = false;
   #colours = {};
   #layer = document.createElement("canvas");
+  #objects = [];
+  on_object = () => {}; // gets the name of an object that was tapped
 
   constructor(path) {
     this.#path = path;
     this.camera = new Camera();
     this.sheet = new Sheet($("path"), () => this.redraw());
-    take_gestures($("path"), this.camera, () => this.redraw());
+    take_gestures($("path"), this.camera, () => this.redraw(), (x, y) => this.#tap(x, y));
     this.#choose("view-2d", "view-3d", (flat) => (this.camera.flat = flat));
     this.#choose("fit-part", "fit-bed", (part) => (this.#fit_part = part));
     $("travels").addEventListener("click", () => {
@@ -42,6 +45,12 @@ export class View {
 
   set axes(axes) {
     this.#axes = axes;
+    this.redraw();
+  }
+
+  /** Show these ({name, center, polygon, is_excluded, is_current}) on the bed. */
+  set objects(objects) {
+    this.#objects = objects;
     this.redraw();
   }
 
@@ -94,6 +103,7 @@ export class View {
     const m = this.camera.matrix(width, height);
     context.clearRect(0, 0, width, height);
     this.#bed(context, m);
+    this.#draw_objects(context, m);
     this.#paint_passed(m, box);
     context.save();
     context.setTransform(1, 0, 0, 1, 0, 0);
@@ -143,6 +153,35 @@ export class View {
     line([x1, y1], [x0, y1]);
     line([x0, y1], [x0, y0]);
     context.stroke();
+  }
+
+  #draw_objects(context, m) {
+    for (const object of this.#objects) {
+      const corners = this.#corners(object, m);
+      context.strokeStyle = this.#colours[object.is_current ? "head" : object.is_excluded ? "dim" : "edge"];
+      context.lineWidth = object.is_current ? 2 : 1.2;
+      context.setLineDash(object.is_excluded ? [4, 4] : []);
+      context.beginPath();
+      corners.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+      context.closePath();
+      context.stroke();
+    }
+    context.setLineDash([]);
+  }
+
+  /** Return the corners of OBJECT on the screen: its polygon, or a square about its centre. */
+  #corners(object, m) {
+    const [cx, cy] = object.center ?? [0, 0];
+    const half = OBJECT_MM / 2;
+    const square = object.center ? [[cx - half, cy - half], [cx + half, cy - half], [cx + half, cy + half], [cx - half, cy + half]] : [];
+    const z = this.#axes?.[2] ?? 0;
+    return (object.polygon?.length ? object.polygon : square).map(([x, y]) => place(m, { x, y, z }));
+  }
+
+  #tap(x, y) {
+    const m = this.camera.matrix(this.sheet.width, this.sheet.height);
+    const found = this.#objects.find((object) => is_inside(this.#corners(object, m), x, y));
+    if (found) this.on_object(found.name);
   }
 
   /** Bring the layer of what is passed up to date. */
@@ -245,6 +284,16 @@ export class View {
     context.strokeStyle = this.#colours.sunk;
     context.stroke();
   }
+}
+
+/** Return whether X, Y is inside the polygon CORNERS: a ray from there crosses its sides an odd number of times. */
+function is_inside(corners, x, y) {
+  let inside = false;
+  for (let i = 0, j = corners.length - 1; i < corners.length; j = i++) {
+    const [[ax, ay], [bx, by]] = [corners[i], corners[j]];
+    if (ay > y !== by > y && x < ((bx - ax) * (y - ay)) / (by - ay) + ax) inside = !inside;
+  }
+  return inside;
 }
 
 function place(m, at) {

@@ -6,7 +6,10 @@ import os
 import shutil
 import signal
 import socket
+import struct
 import time
+import zlib
+from base64 import b64encode
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -61,9 +64,40 @@ def zigzag(lines: int) -> str:
     return "\n".join(["G90", "M83", *moves]) + "\n"
 
 
-JOBS = {"again.gcode": zigzag(3_900), "part.gcode": "G28 X Y\n" + zigzag(3_900)}
-"""A quarter of an hour each, so that no test sees the end; the first is for a machine that is homed. Z, which
-takes longest, stays where it is."""
+def png(width: int, height: int) -> bytes:
+    """Return a picture of one colour."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    rows = (b"\0" + bytes((40, 120, 200)) * width) * height
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    parts = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts
+
+
+def thumbnail(width: int, height: int) -> str:
+    """Return a picture as slicers write it into comments."""
+    text = b64encode(png(width, height)).decode()
+    lines = [f"; {text[i : i + 78]}\n" for i in range(0, len(text), 78)]
+    return f"; thumbnail begin {width}x{height} {len(text)}\n{''.join(lines)}; thumbnail end\n"
+
+
+OBJECTS = """\
+EXCLUDE_OBJECT_DEFINE NAME=left CENTER=30,30 POLYGON=[[20,20],[40,20],[40,40],[20,40]]
+EXCLUDE_OBJECT_DEFINE NAME=right CENTER=70,30
+"""
+JOBS = {"part.gcode": thumbnail(32, 16) + OBJECTS + "G28 X Y\n" + zigzag(3_900)}
+"""A quarter of an hour, so that no test sees the end. Z, which takes longest to be homed, stays as it is."""
+MORE_SECTIONS = """
+[axis_tables]
+[exclude_object]
+[gcode_macro GREET]
+description: Say good morning
+gcode: M118 good morning
+[gcode_macro _INNER]
+gcode: M118 never a button
+"""
 
 
 @dataclass
@@ -84,7 +118,7 @@ class Demo:
         for name, text in JOBS.items():
             (jobs / name).write_text(text)
         machine = self.folder / "demo.cfg"
-        machine.write_text(f"{DEMO_MACHINE.read_text(encoding='utf-8')}\n[axis_tables]\n", encoding="utf-8")
+        machine.write_text(DEMO_MACHINE.read_text(encoding="utf-8") + MORE_SECTIONS, encoding="utf-8")
         words = ("--serve", "--ipc", self.path, "--web", str(self.port), "--jobs", jobs)
         self.command = Command("demo", "--machine", machine, *words)
         self.command.stdout.wait_for("ready")

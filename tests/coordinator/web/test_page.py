@@ -13,7 +13,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, WebSocketRoute
+from playwright.sync_api import Browser, FilePayload, WebSocketRoute
 
 from coordinator.ipc.protocol.methods import Scope
 from tests.coordinator.ipc.served import TOKENS, tokens_file
@@ -227,6 +227,7 @@ def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, 
 
 # --------------------------------------------------------------------------------------------------- a print
 
+BED_MM: Final = 250
 TABLE: Final = {"axis": "x", "positions": [0, 100], "forward": [0, 0.01], "reverse": [-0.02, -0.01]}
 TOLD: Final = """(chart) => !chart.getAttribute("aria-label").includes("\u2013")"""
 """Whether a chart has a value: a dash stands for none."""
@@ -261,6 +262,39 @@ class Printing:
         assert self.page.locator(".node h3").all_text_contents() == ["mcu", "toolhead", "zboard"]
         tab.until("[...document.querySelectorAll('.node .pill')].every((e) => e.textContent === 'ready')")
         self.page.get_by_label("File").select_option("part.gcode")
+        tab.until("document.getElementById('job-picture').width === 32")  # the slicer's picture
+
+    def sets_a_temperature(self) -> None:
+        self.tab.until("document.querySelectorAll('.heat-row').length === 3")
+        self.page.get_by_label("Target of bed, °C").fill("45")
+        self.page.get_by_label("Target of bed, °C").press("Enter")
+        self.tab.until("document.querySelector('[data-name=heater_bed]').textContent.includes('to 45 °C')")
+        assert self.field("modules.heater_bed.target") == 45
+        self.page.get_by_label("Target of extruder, °C").fill("999")
+        self.page.get_by_label("Target of extruder, °C").press("Enter")
+        self.tab.until("document.getElementById('heat-message').textContent.includes('999')")
+        self.page.get_by_label("Speed of fan, %").fill("50")
+        self.tab.until("document.querySelector('[data-name=fan]').textContent.includes('50 %')")
+        self.page.wait_for_function(PAINTED, arg=self.page.locator("#heat-chart").element_handle())
+
+    def field(self, path: str) -> object:
+        return self.machine.ask("state.get", fields=[path])["values"][path]
+
+    def takes_a_file(self) -> None:
+        for text in ("G1 X1\n", "M118 ä\n" * 9_000):  # the second one in three parts, over the first one
+            chosen = FilePayload(name="new.gcode", mimeType="text/plain", buffer=text.encode())
+            self.page.locator("#upload-file").set_input_files(chosen)
+            if len(text) > 9_000:
+                self.page.get_by_role("button", name="Replace it").click()
+            self.tab.until("document.getElementById('job-files').value === 'new.gcode'")
+            self.tab.until_text("upload-message", "new.gcode is in the job folder")
+            assert (self.machine.folder / "jobs" / "new.gcode").read_text(encoding="utf-8") == text
+        self.page.get_by_label("File").select_option("part.gcode")
+
+    def runs_a_macro(self) -> None:
+        assert self.page.locator("#macro-buttons button").all_text_contents() == ["GREET"]
+        self.page.get_by_role("button", name="GREET").click()
+        self.page.locator("#log [data-kind=reply]").filter(has_text="good morning").wait_for()
 
     def takes_a_table(self) -> None:
         tab, x = self.tab, "document.querySelector('[data-axis=x]')"
@@ -374,6 +408,50 @@ class Printing:
         assert points[0] > 5
         late.close()
 
+    def leaves_an_object_out(self) -> None:
+        """It is touched on the toolpath, which opens the list at its entry."""
+        tab, path = self.tab, self.page.locator("#path")
+        self.page.get_by_role("button", name="Bed").click()
+        self.page.get_by_role("button", name="2D").click()
+        assert not self.page.get_by_text("LEFT", exact=True).is_visible()
+        box = path.bounding_box()
+        assert box is not None
+        # From above the whole bed, BED_MM square, is fitted into the canvas with these margins (camera.js).
+        scale = min((box["width"] - 48) / BED_MM, (box["height"] - 64) / BED_MM)
+        middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
+        away = (BED_MM / 2 - 30) * scale
+        self.page.mouse.click(middle[0] - away, middle[1] + away)
+        entry = self.page.locator("#object-list li").filter(has_text="LEFT")
+        entry.get_by_role("button", name="Leave out").click()
+        assert self.field("modules.exclude_object.excluded_objects") == []
+        entry.get_by_role("button", name="Really?").click()
+        tab.until("document.querySelector('[data-name=LEFT]').textContent.includes('left out')")
+        assert self.field("modules.exclude_object.excluded_objects") == ["LEFT"]
+        self.page.get_by_role("button", name="3D").click()
+
+    def asks_about_heaters_after_a_cancel(self) -> None:
+        self.page.get_by_text("The job was cancelled. Still heated: bed.").wait_for()
+        self.page.get_by_role("button", name="Turn the heaters off").click()
+        self.tab.until("document.querySelector('[data-name=heater_bed]').textContent.includes('off')")
+        assert self.field("modules.heater_bed.target") == 0
+        self.page.get_by_text("Earlier jobs").click()
+        self.page.locator("#history-jobs li").filter(has_text="part.gcode").get_by_text(
+            "cancelled"
+        ).wait_for()
+
+    def moves_by_hand(self) -> None:
+        """X and Y are homed, Z is not."""
+        up = self.page.get_by_role("button", name="Z +")
+        assert up.is_disabled()
+        assert up.get_attribute("title") == "home Z first"
+        x = self.field("position.commanded")["x"]  # type: ignore[index]
+        step, button = (1, "X +") if x < 100 else (-1, "X −")  # noqa: RUF001 (the page's minus)
+        self.page.get_by_role("button", name="1", exact=True).click()
+        self.page.get_by_role("button", name=button).click()
+        self.tab.until_text("pos-x", f"{x + step:.2f}")
+        self.page.get_by_role("button", name="Motors off").click()
+        self.tab.until_text("homed", "none")
+
     def cancels_when_asked_twice(self) -> None:
         self.page.get_by_role("button", name="Resume").click()
         self.tab.until_text("state", "printing")
@@ -385,9 +463,9 @@ class Printing:
 
     def stops_at_once(self) -> None:
         tab = self.tab
-        self.page.get_by_label("File").select_option("again.gcode")
         self.page.get_by_role("button", name="Print").click()
-        tab.until("document.getElementById('speed').textContent > '0.0'")
+        tab.until_text("state", "printing")
+        tab.until("Number(document.getElementById('job-row').textContent) > 16")
         self.page.get_by_role("button", name="Emergency stop").click()
         tab.until_text("state", "shutdown")
         cause = "emergency stop by 'the live page (127.0.0.1)'"
@@ -431,13 +509,19 @@ def test_a_print_from_start_to_stop(browser: Browser, machine: Demo) -> None:
     person = Printing(tab, machine)
     person.shows_a_machine_that_is_ready()
     person.takes_a_table()
+    person.sets_a_temperature()
+    person.takes_a_file()
+    person.runs_a_macro()
     person.prints()
     person.shows_figures_of_nodes_and_buses()
     person.pauses()
     person.turns_the_picture_of_the_path()
+    person.leaves_an_object_out()
     person.knows_what_was_done_before_it_was_opened()
     person.cancels_when_asked_twice()
+    person.asks_about_heaters_after_a_cancel()
     person.runs_typed_lines()
+    person.moves_by_hand()
     person.stops_at_once()
     person.comes_back_when_the_coordinator_does()
     hosts = {urlsplit(url).netloc for url in tab.asked}
@@ -459,7 +543,9 @@ def test_layout_names_and_colours(browser: Browser, machine: Demo) -> None:
     check_layout(tab)
     check_names(tab)
     for colours in ("auto", "light", "dark", "night"):
-        check_colours(tab, colours)
+        shown = check_colours(tab, colours)
+    tab.page.reload()
+    assert tab.page.evaluate("document.documentElement.dataset.colours") == shown, "it is remembered"
     tab.until_text("state", "ready")
     check_hiding(tab, sent)
     stopped = tab.page.evaluate("fetch('https://example.com/').then(() => 'sent', (error) => String(error))")
@@ -534,7 +620,8 @@ def watches(text: str) -> str:
     return found[1] if found else ""
 
 
-def check_colours(tab: Visitor, colours: str) -> None:
+def check_colours(tab: Visitor, colours: str) -> str:
+    """Check the contrasts of COLOURS; return which are shown."""
     tab.page.get_by_label("Colours").select_option(colours)
     shown = "light" if colours == "auto" else colours
     assert tab.page.evaluate("document.documentElement.dataset.colours") == shown
@@ -551,8 +638,7 @@ def check_colours(tab: Visitor, colours: str) -> None:
     assert contrast(colour["on-stop"], colour["stop"]) >= 4.5
     assert contrast(colour["on-main"], colour["main"]) >= 4.5
     assert contrast(colour["edge"], colour["card"]) >= 3
-    tab.page.reload()
-    assert tab.page.evaluate("document.documentElement.dataset.colours") == shown, "it is remembered"
+    return shown
 
 
 def contrast(one: str, other: str) -> float:

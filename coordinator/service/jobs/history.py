@@ -1,0 +1,109 @@
+"""The history of jobs: which ended lately, how and when.
+
+A small file outside the job folder, beside the journal; written when a job has ended.
+"""
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from coordinator.support.atomic_file import atomic_write
+
+HISTORY_MAX: Final = 100
+"""Jobs that are kept, the newest ones."""
+_FILE_BYTES_MAX: Final = 1_048_576
+_TEXT_MAX: Final = 2_000
+_NUMBER_END: Final = 1e12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EndedJob:
+    """One job that has ended."""
+
+    file: str
+    state: str
+    """A JobPhase: done, cancelled, failed or stopped."""
+    message: str
+    """Why it failed or stopped."""
+    ended_s: float
+    """Since the epoch, by the computer's clock."""
+    elapsed_s: float
+    """From its start to its end, with pauses."""
+    print_time_s: float
+    """Pauses left out."""
+    filament_mm: float
+    """Drawn in by the extruder."""
+
+
+class JobHistory:
+    """The last HISTORY_MAX jobs, in memory, and in a file once there is one; on the loop.
+
+    REPORT gets a sentence when the file cannot be written; the history in memory is complete nevertheless.
+    """
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._path: Path | None = None
+        self._report = report
+        self._jobs: deque[EndedJob] = deque(maxlen=HISTORY_MAX)
+        self._unwritten = False
+        self._writer: asyncio.Task[None] | None = None
+
+    @property
+    def jobs(self) -> list[EndedJob]:
+        """The jobs, the newest first."""
+        return list(reversed(self._jobs))
+
+    def open(self, path: Path) -> None:
+        """Keep it in the file at PATH, after what is in there; without effect when it is kept already."""
+        if self._path is None:
+            self._path = path
+            self._jobs = deque([*_read(path), *self._jobs], maxlen=HISTORY_MAX)
+
+    def add(self, job: EndedJob) -> None:
+        """Add a job; the file follows."""
+        self._jobs.append(job)
+        if self._path is None:
+            return
+        self._unwritten = True
+        if self._writer is None or self._writer.done():
+            self._writer = asyncio.get_running_loop().create_task(self._write(self._path))
+
+    async def close(self) -> None:
+        """Wait until the file is on the disk."""
+        if self._writer is not None:
+            await self._writer
+
+    async def _write(self, path: Path) -> None:
+        while self._unwritten:
+            self._unwritten = False
+            data = json.dumps([asdict(job) for job in self._jobs], separators=(",", ":")).encode()
+            try:
+                await asyncio.to_thread(atomic_write, path, data)
+            except OSError as error:
+                self._report(f"the history of jobs cannot be written to {path}: {error.strerror or error}")
+
+
+def _read(path: Path) -> list[EndedJob]:
+    """Return the jobs in the file at PATH; what is no job is left out."""
+    try:
+        with path.open("rb") as file:
+            found = json.loads(file.read(_FILE_BYTES_MAX))
+    except (OSError, ValueError, RecursionError):
+        return []
+    return [job for entry in found if (job := _job(entry)) is not None] if isinstance(found, list) else []
+
+
+def _job(entry: Any) -> EndedJob | None:
+    if not isinstance(entry, dict):
+        return None
+    texts = [entry.get(name) for name in ("file", "state", "message")]
+    numbers = [entry.get(name) for name in ("ended_s", "elapsed_s", "print_time_s", "filament_mm")]
+    if not all(isinstance(text, str) and len(text) <= _TEXT_MAX for text in texts):
+        return None
+    if not all(isinstance(number, int | float) and abs(number) < _NUMBER_END for number in numbers):
+        return None
+    return EndedJob(**{name: entry[name] for name in EndedJob.__dataclass_fields__})
