@@ -159,6 +159,7 @@ class Gateway:
         self._subscribed = asyncio.Event()
         """Whether any client may wait for updates."""
         self._updates: asyncio.Task[None] | None = None
+        self._early: asyncio.Handle | None = None
         self._lines: list[str] = []
         self._starts = service.starts
         self._server: asyncio.AbstractServer | None = None
@@ -202,6 +203,9 @@ class Gateway:
         """Take note of a line of the service's log: what g-code answers goes to clients."""
         if "output" in entry:
             self.say(line_of(ReplyKind(str(entry["output"])), str(entry["text"])))
+        if entry["kind"] == "job" and self._early is None:
+            # Moonraker follows a job by each state it is in: none may be gone by the time of the next update.
+            self._early = asyncio.get_running_loop().call_soon(self._send_early)
         if self._service.starts != self._starts and self._service.state is ServiceState.STARTUP:
             # Clients read configuration and objects again only when they have to connect again.
             if self._starts:
@@ -301,14 +305,21 @@ class Gateway:
         while True:
             await self._subscribed.wait()
             await asyncio.sleep(UPDATE_S)
-            try:
-                self._send_changes()
-            except CanductorError:
-                continue  # it is stopped or closed in this moment: the next look finds how it is then
-            except Exception as error:  # noqa: BLE001 (a bug of one module's status must not end all updates)
-                asyncio.get_running_loop().call_exception_handler(
-                    {"message": "canductor: an update of the Klippy API failed", "exception": error}
-                )
+            self._try_to_send()
+
+    def _send_early(self) -> None:
+        self._early = None
+        self._try_to_send()
+
+    def _try_to_send(self) -> None:
+        try:
+            self._send_changes()
+        except CanductorError:
+            return  # it is stopped or closed in this moment: the next look finds how it is then
+        except Exception as error:  # noqa: BLE001 (a bug of one module's status must not end all updates)
+            asyncio.get_running_loop().call_exception_handler(
+                {"message": "canductor: an update of the Klippy API failed", "exception": error}
+            )
 
     def _send_changes(self) -> None:
         watching = [c for c in self._connections if c.client.subscription is not None and c.writable]

@@ -42,10 +42,10 @@ EXPECTED: Final = (
 )
 """Errors of the console that have nothing to do with the host."""
 ABSENT_HOST: Final = re.compile(r'unhandled rejection: {"code":503,"message":"Klippy Host not connected"}')
-"""Fluidd asks for `printer.info` as soon as the host has disconnected, and does not catch that Moonraker refuses;
+"""Fluidd asks for `printer.info` as soon as the host has disconnected, and does not catch Moonraker's error;
 it does the same where no host runs at all. A host that restarts has to disconnect (docs/klippy-api.md)."""
 DEAD: Final = re.compile(
-    r"\b(NaN|undefined|Infinity)\b|not connected|klipper is not|printer is not ready", re.I
+    r"\b(NaN|undefined|Infinity)\b|not connected|klipper is not|printer is not ready", re.IGNORECASE
 )
 COMPLAINTS: Final = re.compile(r"too old|outdated|warning|missing|not found|unsupported", re.IGNORECASE)
 BELL: Final = 'header button:visible:has(path[d^="M10 21H14C14 22.1"])'

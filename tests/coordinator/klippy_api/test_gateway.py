@@ -236,8 +236,30 @@ async def _check_print(client: KlippyClient, served: Served, printer: Printer) -
     assert await client.ask("pause_resume/cancel") == {}
     await look("cancelled")
     assert states == ["printing", "paused", "printing", "paused", "cancelled"], "a cancel is no resume"
+    await _check_jobs_in_a_row(client)
     assert [path.name for path in served.jobs.iterdir()] == ["sub"], "front ends list what is in there"
     assert len(list((served.jobs.parent / "state").glob("journal-*"))) == 1
+
+
+async def _check_jobs_in_a_row(client: KlippyClient) -> None:
+    """A job follows another within less than the time between two updates; each state is seen."""
+
+    async def is_in(state: str) -> None:
+        async with asyncio.timeout(60):
+            while (await client.query("print_stats"))["print_stats"]["state"] != state:
+                await asyncio.sleep(0.01)
+
+    await client.updates(1.0)
+    for _ in range(2):
+        await client.script('SDCARD_PRINT_FILE FILENAME="sub/part.gcode"')
+        await is_in("printing")
+        assert await client.ask("pause_resume/cancel") == {}
+        await is_in("cancelled")
+    updates = await client.updates(0.3)
+    states = [
+        update["print_stats"]["state"] for update in updates if "state" in update.get("print_stats", {})
+    ]
+    assert states == ["printing", "paused", "cancelled"] * 2, "Moonraker's history has both"
 
 
 async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: Served) -> None:
