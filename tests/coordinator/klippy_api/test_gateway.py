@@ -93,6 +93,7 @@ def test_what_moonraker_and_a_browser_ask_for(tmp_path: Path) -> None:
             await _check_mesh(client)
             await _check_outputs(client)
             await _check_print(client, served, printer)
+            await _check_dumps(api, client)
             await _check_stop_and_restart(api, client, served)
             assert api.notices == []
 
@@ -150,6 +151,40 @@ async def _check_motion(client: KlippyClient) -> None:
     assert set(ends) == {"x", "y", "z"}
     assert set(ends.values()) <= {"open", "TRIGGERED"}
     assert set((await client.query("query_endstops"))["query_endstops"]["last_query"].values()) <= {0, 1}
+
+
+async def _check_dumps(api: KlippyApi, client: KlippyClient) -> None:
+    """The executed moves, in order and without jumps, from where the head stood to where it stands."""
+    watcher = api.connect()
+    for name in ("toolhead", "extruder"):
+        params = {"name": name, "response_template": {"method": name}}
+        header = (await watcher.ask("motion_report/dump_trapq", params))["header"]
+        assert header == ["time", "duration", "start_velocity", "acceleration", "start_position", "direction"]
+    assert "one of toolhead, extruder" in await client.error("motion_report/dump_trapq", {"name": "x"})
+    begin = (await client.query("toolhead"))["toolhead"]["position"]
+    await client.script("M83", "G1 X100 Y20 E0.5 F3000", "G1 X110 F6000", "G1 E-0.2 F600", "M400")
+    await watcher.updates(0.5)
+    rows: dict[str, list[Any]] = {"toolhead": [], "extruder": []}
+    for event in watcher.events:
+        rows[event["method"]] += event["params"]["data"]
+    _check_rows(rows["toolhead"], begin[:3], [110, 20, begin[2]])
+    assert max(row[2] for row in rows["toolhead"]) == pytest.approx(100, rel=0.01)
+    _check_rows(rows["extruder"], [begin[3], 0, 0], [begin[3] + 0.3, 0, 0])
+    assert {row[5][0] for row in rows["extruder"]} == {1, -1}
+    watcher.transport.close()
+
+
+def _check_rows(rows: list[Any], begin: list[float], end: list[float]) -> None:
+    """Make sure that ROWS of a dump lead from BEGIN to END without jumps."""
+    at, before_s = begin, 0.0
+    for time_s, duration_s, speed, accel, place, direction in rows:
+        assert time_s >= before_s - 1e-9
+        assert place == pytest.approx(at, abs=1e-6)
+        way = (speed + accel * duration_s / 2) * duration_s
+        assert way >= 0
+        at = [value + way * ratio for value, ratio in zip(place, direction, strict=True)]
+        before_s = time_s + duration_s
+    assert at == pytest.approx(end, abs=1e-6)
 
 
 async def _check_mesh(client: KlippyClient) -> None:
@@ -246,8 +281,8 @@ async def _check_jobs_in_a_row(client: KlippyClient) -> None:
 
     async def is_in(state: str) -> None:
         async with asyncio.timeout(60):
-            while (await client.query("print_stats"))["print_stats"]["state"] != state:
-                await asyncio.sleep(0.01)
+            while (await client.query("print_stats"))["print_stats"]["state"] != state:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)  # faster than updates come
 
     await client.updates(1.0)
     for _ in range(2):
