@@ -5,7 +5,7 @@ all its threads, from /proc. Processor time is in % of one core; a wake-up is a 
 States: waiting (connected, nothing to do), heating (both heaters hold a temperature), printing, watched
 (printing, with a Moonraker that two browsers use: a connection that watches all objects and the answers of
 G-code, with four queries and two `info` a second; --clients 3: as many connections that share these requests;
-by turns with printing, three times). One node is config/cartesian_uart.cfg on a pseudo-terminal, three are
+by turns with printing, twice). One node is config/cartesian_uart.cfg on a pseudo-terminal, three are
 the demo's machine. Each state begins with some seconds that are left out. A script at rest is one G-code line of
 a client of the Klippy API, from its sending to its answer.
 
@@ -48,7 +48,7 @@ FILAMENT_MM = 5.0
 SCRIPTS = 40
 START_S = 60.0
 STATES = ("waiting", "heating", "script", "printing", "watched")
-ROUNDS = 3
+ROUNDS = 2
 """Of printing and watched by turns."""
 WATCHED_S = 0.25
 """Between two queries of all clients together."""
