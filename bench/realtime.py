@@ -6,8 +6,8 @@ States: waiting (connected, nothing to do), heating (both heaters hold a tempera
 (printing, with a Moonraker that two browsers use: a connection that watches all objects and the answers of
 G-code, with four queries and two `info` a second; --clients 3: as many connections that share these requests;
 by turns with printing, twice). One node is config/cartesian_uart.cfg on a pseudo-terminal, three are
-the demo's machine. Each state begins with some seconds that are left out. A script at rest is one G-code line of
-a client of the Klippy API, from its sending to its answer.
+the demo's machine. Each state begins with some seconds that are left out. A script at rest is one G-code line
+of a client of the Klippy API, from its sending to its answer.
 
 With --peer PATH (the peer's klippy.py) the same happens with that host on the same node, configuration file
 and program; its Python is --peer-python. The peer is not a part of this project: without the option only
@@ -48,6 +48,8 @@ FILAMENT_MM = 5.0
 SCRIPTS = 40
 START_S = 60.0
 STATES = ("waiting", "heating", "script", "printing", "watched")
+PRINTS = 3
+"""One after the other: long enough for all states."""
 ROUNDS = 2
 """Of printing and watched by turns."""
 WATCHED_S = 0.25
@@ -160,7 +162,9 @@ def machine(config: Path, folder: Path) -> Iterator[Path]:
         if "min_extrude_temp" not in text:
             text = text.replace("[extruder]\n", "[extruder]\nmin_extrude_temp: 0\n")
         lines = PROGRAM.read_text(encoding="utf-8").splitlines(keepends=True)
-        (jobs / "part.gcode").write_text("".join(line for line in lines if not line.startswith("M1")))
+        (jobs / "part.gcode").write_text(
+            "".join(line for line in lines if not line.startswith("M1")) * PRINTS
+        )
         played = folder / "printer.cfg"
         played.write_text(text + CARD.format(folder=jobs), encoding="utf-8")
         yield played

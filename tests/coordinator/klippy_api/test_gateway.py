@@ -103,6 +103,8 @@ def test_what_moonraker_and_a_browser_ask_for(tmp_path: Path) -> None:
 async def _check_objects(client: KlippyClient, objects: list[str]) -> None:
     status = await client.watch(dict.fromkeys(objects))
     assert schema.problems(status) == []
+    asked = await client.ask("objects/query", {"objects": {"extruder": ["can_extrude"]}})
+    assert asked["status"] == {"extruder": {"can_extrude": False}}
     nodes = [name for name in objects if name.partition(" ")[0] == "mcu"]
     assert len(nodes) == 2
     for node in nodes:
