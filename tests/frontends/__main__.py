@@ -42,7 +42,7 @@ def _run(program: str, chromium: str, archives: Path, folder: Path, pictures: Pa
     config, socket, port = (
         data / "config" / "printer.cfg",
         data / "comms" / "klippy.sock",
-        moonraker._free_port(),
+        moonraker.free_port(),
     )
     (data / "config" / "moonraker.conf").write_text(moonraker.MOONRAKER.format(port=port, socket=socket))
     (data / "gcodes" / JOB_NAME).write_text(moonraker.JOB)
@@ -65,6 +65,8 @@ def _run(program: str, chromium: str, archives: Path, folder: Path, pictures: Pa
                         sys.stdout.flush()
         except (Failed, Error) as failure:
             sys.stdout.write(f"FAILED: {failure}\n")
+            for log in (folder / "canductor.log", folder / "moonraker.log"):
+                sys.stdout.write(f"--- {log.name}\n{moonraker.last_lines(log)}\n")
             return 1
         finally:
             browser.close()

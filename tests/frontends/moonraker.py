@@ -251,12 +251,14 @@ def _check(true: object, what: str, found: object) -> None:
         raise Failed(f"{what}: {found}")
 
 
-def _without_requests(log: Path) -> str:
+def last_lines(log: Path) -> str:
+    """Return the end of LOG, without Moonraker's lines about requests."""
     lines = [line for line in log.read_text(errors="replace").splitlines() if "log_request" not in line]
     return "\n".join(lines[-LOG_LINES:])
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return a port of this computer that nothing serves."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         return int(listener.getsockname()[1])
 
@@ -291,7 +293,7 @@ def main() -> int:
             (data / part).mkdir(parents=True)
         config = data / "config" / "printer.cfg"
         config.write_text(DEMO_MACHINE.read_text() + SECTIONS.format(gcodes=gcodes))
-        path, port = data / "comms" / "klippy.sock", _free_port()
+        path, port = data / "comms" / "klippy.sock", free_port()
         (data / "config" / "moonraker.conf").write_text(MOONRAKER.format(port=port, socket=path))
         host = [sys.executable, "-c", "from coordinator.cli.main import main; raise SystemExit(main())"]
         serve = [
@@ -316,7 +318,7 @@ def main() -> int:
             except Failed as failure:
                 sys.stdout.write(f"FAILED: {failure}\n")
                 for log in (folder / "canductor.log", folder / "moonraker.log"):
-                    sys.stdout.write(f"--- {log.name}\n{_without_requests(log)}\n")
+                    sys.stdout.write(f"--- {log.name}\n{last_lines(log)}\n")
                 return 1
     return 0
 
