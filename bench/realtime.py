@@ -2,10 +2,12 @@
 
 Virtual nodes with a plant play a machine; `canductor run` is a process of its own, and only that is measured,
 all its threads, from /proc. Processor time is in % of one core; a wake-up is a voluntary context switch.
-States: waiting (connected, nothing to do), heating (both heaters hold a temperature), printing. One node is
-config/cartesian_uart.cfg on a pseudo-terminal, three are the demo's machine. Each state begins with some
-seconds that are left out. A script at rest is one G-code line of a client of the Klippy API, from its sending
-to its answer.
+States: waiting (connected, nothing to do), heating (both heaters hold a temperature), printing, watched
+(printing, with a Moonraker that two browsers use: a connection that watches all objects and the answers of
+G-code, with four queries and two `info` a second; --clients 3: as many connections that share these requests;
+by turns with printing, twice). One node is config/cartesian_uart.cfg on a pseudo-terminal, three are
+the demo's machine. Each state begins with some seconds that are left out. A script at rest is one G-code line
+of a client of the Klippy API, from its sending to its answer.
 
 With --peer PATH (the peer's klippy.py) the same happens with that host on the same node, configuration file
 and program; its Python is --peer-python. The peer is not a part of this project: without the option only
@@ -24,13 +26,15 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from coordinator.assembly.load import load_machine
+from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.virtual_machine.virtual_machine import VirtualMachine, VirtualMachineOptions
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,7 +47,13 @@ FILAMENT_MM = 5.0
 """Once the print has taken so much it is not homing any more."""
 SCRIPTS = 40
 START_S = 60.0
-STATES = ("waiting", "heating", "script", "printing")
+STATES = ("waiting", "heating", "script", "printing", "watched")
+PRINTS = 3
+"""One after the other: long enough for all states."""
+ROUNDS = 2
+"""Of printing and watched by turns."""
+WATCHED_S = 0.25
+"""Between two queries of all clients together."""
 CARD = "\n[virtual_sdcard]\npath: {folder}\n"
 
 
@@ -119,6 +129,12 @@ class KlippyClient:
                     raise RuntimeError(f"{method}: {answer['error']}")
                 return dict(answer["result"])
 
+    def watch(self) -> None:
+        """Watch all objects and what G-code answers."""
+        objects = dict.fromkeys(self.call("objects/list")["objects"])
+        self.call("objects/subscribe", objects=objects, response_template={"method": "changed"})
+        self.call("gcode/subscribe_output", response_template={"method": "said"})
+
     def script(self, line: str) -> None:
         """Run LINE."""
         self.call("gcode/script", script=line)
@@ -146,7 +162,9 @@ def machine(config: Path, folder: Path) -> Iterator[Path]:
         if "min_extrude_temp" not in text:
             text = text.replace("[extruder]\n", "[extruder]\nmin_extrude_temp: 0\n")
         lines = PROGRAM.read_text(encoding="utf-8").splitlines(keepends=True)
-        (jobs / "part.gcode").write_text("".join(line for line in lines if not line.startswith("M1")))
+        (jobs / "part.gcode").write_text(
+            "".join(line for line in lines if not line.startswith("M1")) * PRINTS
+        )
         played = folder / "printer.cfg"
         played.write_text(text + CARD.format(folder=jobs), encoding="utf-8")
         yield played
@@ -220,12 +238,66 @@ def measure_script(client: KlippyClient) -> None:
     )
 
 
+@contextlib.contextmanager
+def watched(api: Path, clients: int) -> Iterator[None]:
+    """Ask and watch as Moonraker and two browsers do, by as many CLIENTS, until the block ends."""
+    over = threading.Event()
+
+    def ask() -> None:
+        client = KlippyClient(api)
+        client.watch()
+        asked = {"toolhead": None, "print_stats": None, "extruder": ["temperature", "target"]}
+        count = 0
+        while not over.wait(WATCHED_S * clients):
+            count += 1
+            client.call("objects/query", objects=asked)
+            if count % 2 == 0:
+                client.call("info")
+        client.close()
+
+    threads = [threading.Thread(target=ask) for _ in range(clients)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+
+
+def print_lead(ipc: Path) -> None:
+    """Print the smallest lead so far, of a host that says it."""
+    if ipc.exists():
+        with BlockingClient(str(ipc)) as client:
+            values = client.call("state.get", {"fields": ["machine.lead_min_ms"]})["values"]
+        print(f"             smallest lead since the start: {values['machine.lead_min_ms']} ms", flush=True)
+
+
 def print_stats(client: KlippyClient) -> dict[str, Any]:
     """Return how the print does; ends the benchmark when it does not print."""
     stats = client.call("objects/query", objects={"print_stats": None})["status"]["print_stats"]
     if stats["state"] not in ("printing", "standby"):  # it has begun, or is about to
         sys.exit(f"it does not print: {stats}")
     return dict(stats)
+
+
+def run_print(
+    client: KlippyClient, state: Callable[[str], None], api: Path, chosen: argparse.Namespace
+) -> None:
+    """Measure a host in the states of a print."""
+    client.script("M140 S60\nM104 S200")
+    client.script("SDCARD_PRINT_FILE FILENAME=part.gcode")
+    while print_stats(client)["filament_used"] < FILAMENT_MM:
+        time.sleep(0.5)
+    for _ in range(ROUNDS if "watched" in chosen.only else 1):  # no part of a print costs the same
+        state("printing")
+        if "watched" in chosen.only:
+            with watched(api, chosen.clients):
+                state("watched")
+    print_lead(api.parent / "ipc")
+    if print_stats(client)["state"] != "printing":
+        sys.exit("the print ended before it was measured; take fewer --seconds")
 
 
 def run_states(command: list[str], api: Path, folder: Path, chosen: argparse.Namespace) -> None:
@@ -245,21 +317,25 @@ def run_states(command: list[str], api: Path, folder: Path, chosen: argparse.Nam
         if "heating" in chosen.only:
             client.script("M140 S60\nM104 S200")
             state("heating")
-        if "printing" in chosen.only:
-            client.script("M140 S60\nM104 S200")
-            client.script("SDCARD_PRINT_FILE FILENAME=part.gcode")
-            while print_stats(client)["filament_used"] < FILAMENT_MM:
-                time.sleep(0.5)
-            state("printing")
-            if print_stats(client)["state"] != "printing":
-                sys.exit("the print ended before it was measured; take fewer --seconds")
+        if {"printing", "watched"} & set(chosen.only):
+            run_print(client, state, api, chosen)
         client.close()
 
 
 def ours(config: Path, api: Path) -> list[str]:
     """Return the command line of this host."""
     begin = "from coordinator.cli.entry import main; raise SystemExit(main())"
-    return [sys.executable, "-c", begin, "run", str(config), "--klippy-api", str(api)]
+    return [
+        sys.executable,
+        "-c",
+        begin,
+        "run",
+        str(config),
+        "--klippy-api",
+        str(api),
+        "--ipc",
+        str(api.parent / "ipc"),
+    ]
 
 
 def peers(python: str, peer: Path, config: Path, api: Path) -> list[str]:
@@ -282,6 +358,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=15.0, help="measured of each state")
     parser.add_argument("--only", nargs="+", choices=STATES, default=list(STATES))
     parser.add_argument("--nodes", type=int, nargs="+", choices=(1, 3), default=[1, 3])
+    parser.add_argument("--clients", type=int, default=1, help="that watch a print")
     parser.add_argument("--threads", action="store_true", help="print each thread, too")
     parser.add_argument("--peer", type=Path, help="klippy.py of the peer")
     parser.add_argument(

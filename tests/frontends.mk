@@ -8,8 +8,13 @@ build/frontends/$(MOONRAKER):
 	build/frontends/bin/pip install --quiet --disable-pip-version-check $(MOONRAKER)
 	touch $@
 
+# Builds of Mainsail and Fluidd (tests/frontends/browser.py names them); without them, or without Chromium, the
+# second line says that it skips them.
+FRONT_ENDS ?= ../shared/frontends
+
 frontends: setup build/frontends/$(MOONRAKER)
 	$(BIN)/python -m tests.frontends.moonraker build/frontends/bin/moonraker
+	$(BIN)/python -m tests.frontends build/frontends/bin/moonraker $(FRONT_ENDS)
 
 OCTOPRINT := octoprint==1.11.8
 

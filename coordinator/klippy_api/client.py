@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
 
+from coordinator.klippy_api.move_dump import MoveDump
 from coordinator.klippy_api.subscription import Subscription
 from coordinator.klippy_api.wire import (
     Framer,
@@ -18,6 +19,8 @@ from coordinator.klippy_api.wire import (
 RUNNING_MAX: Final = 64
 """Calls of one client that run; more are answered with an error."""
 REMOTE_METHODS_MAX: Final = 64
+DUMPS_MAX: Final = 16
+"""Dumps of moves that one client receives."""
 
 
 class Client:
@@ -30,6 +33,7 @@ class Client:
         """The template of lines that g-code answers; None: it does not listen to them."""
         self.remote_methods: dict[str, Mapping[str, Any]] = {}
         """Templates by name."""
+        self.dumps: list[MoveDump] = []
         self.running = 0
         """Calls that are not answered yet."""
         self.dropped = 0

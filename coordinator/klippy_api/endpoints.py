@@ -10,7 +10,8 @@ from typing import Any, Final
 
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
-from coordinator.klippy_api.client import REMOTE_METHODS_MAX, Client
+from coordinator.klippy_api.client import DUMPS_MAX, REMOTE_METHODS_MAX, Client
+from coordinator.klippy_api.move_dump import HEADER, TOOLHEAD, MoveDump
 from coordinator.klippy_api.params import RequestError, objects_param, template_param, text_param
 from coordinator.klippy_api.script import run_lines
 from coordinator.klippy_api.status import StatusBuilder, state_of
@@ -84,6 +85,7 @@ class Endpoints:
             "pause_resume/resume": lambda _client, _request: self._lines("RESUME"),
             "pause_resume/cancel": lambda _client, _request: self._lines("CANCEL_PRINT"),
         }
+        self._moving: dict[str, Endpoint] = {"motion_report/dump_trapq": self._dump_moves}
         self._levelling: dict[str, Endpoint] = {"bed_mesh/dump_mesh": self._dump_mesh}
         self._homing: dict[str, Endpoint] = {"query_endstops/status": self._endstops}
 
@@ -92,6 +94,7 @@ class Endpoints:
         found = dict(self._always)
         machine = self._service.machine
         if machine is not None:
+            found |= self._moving
             if next(machine.modules.of(PauseResume), None) is not None:
                 found |= self._pausing
             if next(machine.modules.of(BedMesh), None) is not None:
@@ -137,6 +140,17 @@ class Endpoints:
             return next(self._service.up_machine().modules.of(BedMesh)).dump(arguments)
         except WordError as error:
             raise RequestError(f"{request.method}: {error}") from None
+
+    def _dump_moves(self, client: Client, request: Request) -> Result:
+        name, template = text_param(request, "name"), template_param(request)
+        described, motion = self._service.up_machine().description, self._service.ready_motion()
+        known = [TOOLHEAD, *(extruder.name for extruder in described.extruders)]
+        if name not in known:
+            raise RequestError(f"{request.method}: 'name' must be one of {', '.join(known)}")
+        if len(client.dumps) >= DUMPS_MAX:
+            raise RequestError(f"a client may have {DUMPS_MAX} dumps")
+        client.dumps.append(MoveDump(name, template, motion.now_s))
+        return {"header": HEADER}
 
     def _endstops(self, _client: Client, _request: Request) -> Awaitable[Result]:
         job = self._service.active_job

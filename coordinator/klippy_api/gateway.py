@@ -5,7 +5,7 @@ import contextlib
 import socket
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.ipc.server.fair_scheduler import FairScheduler
@@ -13,6 +13,7 @@ from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
+from coordinator.klippy_api.subscription import Status
 from coordinator.klippy_api.wire import Request, UnreadableError, error_message, event_message, result_message
 from coordinator.service.core.machine_service import MachineService, ServiceState
 from coordinator.service.state.log_ring import Entry
@@ -159,6 +160,7 @@ class Gateway:
         self._subscribed = asyncio.Event()
         """Whether any client may wait for updates."""
         self._updates: asyncio.Task[None] | None = None
+        self._early: asyncio.Handle | None = None
         self._lines: list[str] = []
         self._starts = service.starts
         self._server: asyncio.AbstractServer | None = None
@@ -202,6 +204,9 @@ class Gateway:
         """Take note of a line of the service's log: what g-code answers goes to clients."""
         if "output" in entry:
             self.say(line_of(ReplyKind(str(entry["output"])), str(entry["text"])))
+        if entry["kind"] == "job" and self._early is None:
+            # Moonraker follows a job by each state it is in: none may be gone by the time of the next update.
+            self._early = asyncio.get_running_loop().call_soon(self._send_early)
         if self._service.starts != self._starts and self._service.state is ServiceState.STARTUP:
             # Clients read configuration and objects again only when they have to connect again.
             if self._starts:
@@ -257,7 +262,7 @@ class Gateway:
         except Exception as error:  # noqa: BLE001 (a bug of one endpoint must not end the machine)
             self._fail(connection, request, self._sentence(request, error))
             return
-        if client.subscription is not None:
+        if client.subscription is not None or client.dumps:
             self._subscribed.set()
         if isinstance(result, Awaitable):
             client.running += 1
@@ -301,28 +306,54 @@ class Gateway:
         while True:
             await self._subscribed.wait()
             await asyncio.sleep(UPDATE_S)
-            try:
-                self._send_changes()
-            except CanductorError:
-                continue  # it is stopped or closed in this moment: the next look finds how it is then
-            except Exception as error:  # noqa: BLE001 (a bug of one module's status must not end all updates)
-                asyncio.get_running_loop().call_exception_handler(
-                    {"message": "canductor: an update of the Klippy API failed", "exception": error}
-                )
+            self._try_to_send()
+
+    def _send_early(self) -> None:
+        self._early = None
+        self._try_to_send()
+
+    def _try_to_send(self) -> None:
+        try:
+            self._send_changes()
+        except CanductorError:
+            return  # it is stopped or closed in this moment: the next look finds how it is then
+        except Exception as error:  # noqa: BLE001 (a bug of one module's status must not end all updates)
+            asyncio.get_running_loop().call_exception_handler(
+                {"message": "canductor: an update of the Klippy API failed", "exception": error}
+            )
 
     def _send_changes(self) -> None:
-        watching = [c for c in self._connections if c.client.subscription is not None and c.writable]
+        waiting = [c for c in self._connections if c.client.subscription is not None or c.client.dumps]
+        if not waiting:
+            self._subscribed.clear()
+        reading = [connection for connection in waiting if connection.writable]
+        self._send_moves(reading)
+        watching = [connection for connection in reading if connection.client.subscription is not None]
         if not watching:
-            if all(connection.client.subscription is None for connection in self._connections):
-                self._subscribed.clear()
             return
         status, now_s = self.endpoints.status.build(), self._service.now_s
+        # Clients that watch the same have the same changes: those are encoded once.
+        encoded: tuple[Mapping[str, Any], Status, bytes] | None = None
         for connection in watching:
             subscription = connection.client.subscription
             changed = None if subscription is None else subscription.changes(status)
-            if subscription is not None and changed:
+            if subscription is None or not changed:
+                continue
+            if encoded is None or encoded[:2] != (subscription.template, changed):
                 params = {"eventtime": now_s, "status": changed}
-                connection.send(event_message(subscription.template, params))
+                encoded = subscription.template, changed, event_message(subscription.template, params)
+            connection.send(encoded[2])
+
+    def _send_moves(self, reading: list[Connection]) -> None:
+        motion, machine = self._service.motion, self._service.machine
+        if motion is None or machine is None or machine.stopped is not None:
+            return
+        active = motion.planned.figures.get("toolhead", {}).get("extruder")
+        for connection in reading:
+            for dump in connection.client.dumps:
+                rows = dump.take(motion.trace, motion.now_s, active)
+                if rows:
+                    connection.send(event_message(dump.template, {"data": rows}))
 
     def say(self, text: str) -> None:
         """Show TEXT to all who listen to g-code, together with what else comes in this round of the loop."""

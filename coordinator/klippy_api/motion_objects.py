@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from coordinator.config.model import MachineDescription
+from coordinator.config.model import SECOND_CARRIAGE, MachineDescription
+from coordinator.kinematics.dual_carriage import CarriageMode
 from coordinator.service.core.motion import Motion
 
 Objects = dict[str, dict[str, Any]]
@@ -47,7 +48,10 @@ def _names(described: "MachineDescription") -> dict[str, Any]:
 
 
 def idle_objects(described: "MachineDescription") -> Objects:
-    """Return the same of a machine that is not ready yet: its limits, and nothing homed."""
+    """Return the same of a machine that is not ready yet: its limits, and nothing homed.
+
+    All fields are there: a client that watches a whole object gets those that it has at that moment.
+    """
     limits, extruder = described.limits, described.extruder
     active = "" if extruder is None else extruder.name
     nowhere = [0.0] * 4
@@ -69,6 +73,7 @@ def idle_objects(described: "MachineDescription") -> Objects:
     gcode_move = {
         "gcode_position": nowhere,
         "position": nowhere,
+        "base": nowhere,
         "homing_origin": nowhere,
         "speed": 0.0,
         "speed_factor": 1.0,
@@ -83,4 +88,18 @@ def idle_objects(described: "MachineDescription") -> Objects:
         "live_extruder_velocity": 0.0,
         **_names(described),
     }
-    return {"toolhead": toolhead, "gcode_move": gcode_move, "motion_report": report}
+    objects = {"toolhead": toolhead, "gcode_move": gcode_move, "motion_report": report}
+    for follower in described.extruder_steppers:
+        objects[f"extruder_stepper {follower.name}"] = {"motion_queue": follower.extruder or None}
+    for each in described.extruders:
+        objects[each.name] = {
+            "motion_queue": each.name,
+            "pressure_advance": each.pressure_advance,
+            "smooth_time": each.smooth_time_s,
+        }
+    if described.dual_carriage is not None:
+        objects[SECOND_CARRIAGE] = {
+            "carriage_0": CarriageMode.PRIMARY.value,
+            "carriage_1": CarriageMode.INACTIVE.value,
+        }
+    return objects

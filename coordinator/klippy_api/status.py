@@ -151,6 +151,10 @@ class StatusBuilder:
             for name in objects["heaters"]["available_sensors"]:
                 if name in objects and objects[name].get("temperature", 0.0) is None:
                     objects[name] = {**objects[name], "temperature": 0.0}
+                if objects.get(name, {}).get("measured_min_temp", 0.0) is None:
+                    now_c = objects[name]["temperature"]
+                    lowest_highest = {"measured_min_temp": now_c, "measured_max_temp": now_c}
+                    objects[name] = {**objects[name], **lowest_highest}
         else:
             objects["heaters"] = {f"available_{kind}": [] for kind in ("heaters", "sensors", "monitors")}
 

@@ -1,5 +1,6 @@
-"""`python -m tests.frontends MOONRAKER ARCHIVES [PICTURES]`: Mainsail and Fluidd on a virtual machine.
+"""`python -m tests.frontends MOONRAKER ARCHIVES [PICTURES]`: Mainsail and Fluidd drive `canductor run`.
 
+The boards are virtual; Moonraker and the builds of the front ends are unmodified.
 Ends with status 0 and a line that says so where ARCHIVES or Chromium is missing.
 """
 
@@ -11,9 +12,9 @@ from pathlib import Path
 
 from playwright.sync_api import Error, sync_playwright
 
-from coordinator.support.examples import DEMO_MACHINE
 from tests.frontends import moonraker
 from tests.frontends.browser import BUILDS, JOB_NAME, Screen, drive, served, unpack
+from tests.frontends.hardware import hardware
 from tests.frontends.moonraker import Failed, Moonraker, running, until
 
 
@@ -41,14 +42,14 @@ def _run(program: str, chromium: str, archives: Path, folder: Path, pictures: Pa
     config, socket, port = (
         data / "config" / "printer.cfg",
         data / "comms" / "klippy.sock",
-        moonraker._free_port(),
+        moonraker.free_port(),
     )
-    config.write_text(DEMO_MACHINE.read_text() + moonraker.SECTIONS.format(gcodes=data / "gcodes"))
     (data / "config" / "moonraker.conf").write_text(moonraker.MOONRAKER.format(port=port, socket=socket))
     (data / "gcodes" / JOB_NAME).write_text(moonraker.JOB)
-    words = ["demo", "--machine", str(config), "--serve", "--klippy-api", str(socket)]
-    host = [sys.executable, "-m", "coordinator.cli.main", *words, "--ipc", str(folder / "ipc")]
+    words = ["run", str(config), "--klippy-api", str(socket), "--ipc", str(folder / "ipc")]
+    host = [sys.executable, "-m", "coordinator.cli.main", *words]
     with (
+        hardware(config, folder, moonraker.SECTIONS.format(gcodes=data / "gcodes")),
         running(host, folder / "canductor.log", {}),
         running([program, "-d", str(data)], folder / "moonraker.log", {}),
         sync_playwright() as driver,
@@ -59,11 +60,13 @@ def _run(program: str, chromium: str, archives: Path, folder: Path, pictures: Pa
             until(lambda: api.state() == "ready", "ready")
             for name in BUILDS:
                 with served(unpack(archives, name, folder), port) as address:
-                    for step in drive(Screen(name, browser, address), api, pictures):
+                    for step in drive(Screen(name, browser, address), api, config, pictures):
                         sys.stdout.write(f"ok: {step}\n")
                         sys.stdout.flush()
         except (Failed, Error) as failure:
             sys.stdout.write(f"FAILED: {failure}\n")
+            for log in (folder / "canductor.log", folder / "moonraker.log"):
+                sys.stdout.write(f"--- {log.name}\n{moonraker.last_lines(log)}\n")
             return 1
         finally:
             browser.close()

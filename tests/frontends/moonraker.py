@@ -5,8 +5,10 @@ line per step and ends with status 0 when all went as a user expects.
 """
 
 import argparse
+import asyncio
 import contextlib
 import http.client
+import itertools
 import json
 import os
 import signal
@@ -19,6 +21,8 @@ import urllib.parse
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
+
+import aiohttp
 
 from coordinator.support.examples import DEMO_MACHINE
 
@@ -80,12 +84,12 @@ class Moonraker:
     """Its HTTP interface at PORT."""
 
     def __init__(self, port: int) -> None:
-        self._port = port
+        self.port = port
 
     def ask(self, path: str, *, post: bool = False, body: bytes = b"", kind: str = "", **values: str) -> Any:
         """Return ``result``; raises Failed with what Moonraker says."""
         where = path + ("?" + urllib.parse.urlencode(values) if values else "")
-        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=STEP_S)
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=STEP_S)
         with contextlib.closing(connection):
             headers = {"Content-Type": kind} if kind else {}
             connection.request("POST" if post or body else "GET", where, body or None, headers)
@@ -112,6 +116,10 @@ class Moonraker:
         """Return objects by name."""
         found = self.ask("/printer/objects/query?" + "&".join(map(urllib.parse.quote, names)))
         return dict(found["status"])
+
+    def objects(self) -> list[str]:
+        """Return the names of all objects."""
+        return list(self.ask("/printer/objects/list")["objects"])
 
     def script(self, *lines: str) -> None:
         """Have lines done."""
@@ -155,10 +163,11 @@ def drive(api: Moonraker, gcodes: Path) -> Iterator[str]:
     _check(not server["failed_components"], "no component failed", server["failed_components"])
     _check(not server["warnings"], "no warnings", server["warnings"])
     yield "connected, ready, no warnings"
-    objects = api.ask("/printer/objects/list")["objects"]
+    objects = api.objects()
     status = api.query(*objects)
     _check(set(status) == set(objects), "all objects", set(objects) ^ set(status))
     yield f"{len(objects)} objects"
+    yield asyncio.run(watch(api.port))
     api.script("G28", "M400")
     _check(api.query("toolhead")["toolhead"]["homed_axes"] == "xyz", "homed", api.query("toolhead"))
     api.script("M105")
@@ -197,17 +206,59 @@ def drive(api: Moonraker, gcodes: Path) -> Iterator[str]:
     yield "ready again"
 
 
+async def watch(port: int) -> str:
+    """Do over the websocket what a browser does; return what was seen to work. Raises Failed."""
+    async with (
+        asyncio.timeout(STEP_S),
+        aiohttp.ClientSession() as session,
+        session.ws_connect(f"http://127.0.0.1:{port}/websocket") as line,
+    ):
+        ids = itertools.count(1)
+        heard: list[tuple[str, Any]] = []
+
+        async def ask(method: str, **params: Any) -> Any:
+            number = next(ids)
+            await line.send_json({"jsonrpc": "2.0", "id": number, "method": method, "params": params})
+            while (message := await line.receive_json()).get("id") != number:
+                heard.append((message["method"], message.get("params")))
+            if "error" in message:
+                raise Failed(f"{method}: {message['error']}")
+            return message["result"]
+
+        objects = (await ask("printer.objects.list"))["objects"]
+        shown = (await ask("printer.objects.subscribe", objects=dict.fromkeys(objects)))["status"]
+        _check(set(shown) == set(objects), "all objects are shown", set(objects) ^ set(shown))
+        helped = await ask("printer.gcode.help")
+        _check("G28" in helped or "PAUSE" in helped, "help", helped)
+        for script in ("SET_VELOCITY_LIMIT ACCEL=1234", "M115", "SET_VELOCITY_LIMIT ACCEL=3000"):
+            await ask("printer.gcode.script", script=script)
+        accelerations: list[float] = []
+        while 3000 not in accelerations[1:] and len(heard) < 1000:
+            message = await line.receive_json()
+            heard.append((message["method"], message.get("params")))
+            updates = [params[0] for method, params in heard if method == "notify_status_update"]
+            accelerations = [
+                u["toolhead"]["max_accel"] for u in updates if "max_accel" in u.get("toolhead", {})
+            ]
+            accelerations = [shown["toolhead"]["max_accel"], *accelerations]
+        replies = [params[0] for method, params in heard if method == "notify_gcode_response"]
+        _check(any(text.startswith("FIRMWARE_NAME:") for text in replies), "M115 is shown", replies)
+    return f"websocket: {len(shown)} objects, {len(replies)} replies, updates"
+
+
 def _check(true: object, what: str, found: object) -> None:
     if not true:
         raise Failed(f"{what}: {found}")
 
 
-def _without_requests(log: Path) -> str:
+def last_lines(log: Path) -> str:
+    """Return the end of LOG, without Moonraker's lines about requests."""
     lines = [line for line in log.read_text(errors="replace").splitlines() if "log_request" not in line]
     return "\n".join(lines[-LOG_LINES:])
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return a port of this computer that nothing serves."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         return int(listener.getsockname()[1])
 
@@ -242,7 +293,7 @@ def main() -> int:
             (data / part).mkdir(parents=True)
         config = data / "config" / "printer.cfg"
         config.write_text(DEMO_MACHINE.read_text() + SECTIONS.format(gcodes=gcodes))
-        path, port = data / "comms" / "klippy.sock", _free_port()
+        path, port = data / "comms" / "klippy.sock", free_port()
         (data / "config" / "moonraker.conf").write_text(MOONRAKER.format(port=port, socket=path))
         host = [sys.executable, "-c", "from coordinator.cli.main import main; raise SystemExit(main())"]
         serve = [
@@ -267,7 +318,7 @@ def main() -> int:
             except Failed as failure:
                 sys.stdout.write(f"FAILED: {failure}\n")
                 for log in (folder / "canductor.log", folder / "moonraker.log"):
-                    sys.stdout.write(f"--- {log.name}\n{_without_requests(log)}\n")
+                    sys.stdout.write(f"--- {log.name}\n{last_lines(log)}\n")
                 return 1
     return 0
 

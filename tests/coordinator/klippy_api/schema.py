@@ -1,10 +1,13 @@
 """Types and units of what clients read, object by object: section 6 of the peer's facts, as data."""
 
+import math
 from typing import Any, Final
 
 NUMBER: Final = (int, float)
 AXES: Final = "four numbers"
+LAYERS: Final = "numbers of layers, or null"
 TEXT_OR_NONE: Final = (str, type(None))
+NUMBER_OR_NONE: Final = (int, float, type(None))
 
 SCHEMA: Final[dict[str, dict[str, Any]]] = {
     "webhooks": {"state": str, "state_message": str},
@@ -64,7 +67,7 @@ SCHEMA: Final[dict[str, dict[str, Any]]] = {
         "print_duration": NUMBER,
         "filament_used": NUMBER,
         "message": str,
-        "info": dict,
+        "info": LAYERS,
     },
     "virtual_sdcard": {
         "file_path": TEXT_OR_NONE,
@@ -90,9 +93,109 @@ SCHEMA: Final[dict[str, dict[str, Any]]] = {
     "exclude_object": {"objects": list, "excluded_objects": list, "current_object": TEXT_OR_NONE},
     "stepper_enable": {"steppers": dict},
     "query_endstops": {"last_query": dict},
-    "manual_probe": {"is_active": bool},
+    "manual_probe": {
+        "is_active": bool,
+        "z_position": NUMBER_OR_NONE,
+        "z_position_lower": NUMBER_OR_NONE,
+        "z_position_upper": NUMBER_OR_NONE,
+    },
+    "heater_generic": {"temperature": NUMBER, "target": NUMBER, "power": NUMBER},
+    "temperature_sensor": {
+        "temperature": NUMBER,
+        "measured_min_temp": NUMBER,
+        "measured_max_temp": NUMBER,
+    },
+    "temperature_fan": {
+        "speed": NUMBER,
+        "rpm": NUMBER_OR_NONE,
+        "temperature": NUMBER,
+        "target": NUMBER,
+    },
+    "fan": {"speed": NUMBER, "rpm": NUMBER_OR_NONE},
+    "fan_generic": {"speed": NUMBER, "rpm": NUMBER_OR_NONE},
+    "heater_fan": {"speed": NUMBER, "rpm": NUMBER_OR_NONE},
+    "controller_fan": {"speed": NUMBER, "rpm": NUMBER_OR_NONE},
+    "output_pin": {"value": NUMBER},
+    "filament_switch_sensor": {"enabled": bool, "filament_detected": bool},
+    "firmware_retraction": {
+        "retract_length": NUMBER,
+        "retract_speed": NUMBER,
+        "unretract_extra_length": NUMBER,
+        "unretract_speed": NUMBER,
+    },
+    "tmc2209": {
+        "run_current": NUMBER,
+        "hold_current": NUMBER,
+        "drv_status": (dict, type(None)),
+        "temperature": NUMBER_OR_NONE,
+        "mcu_phase_offset": (int, type(None)),
+        "phase_offset_position": NUMBER_OR_NONE,
+    },
+    "save_variables": {"variables": dict},
+    "bed_mesh": {
+        "profile_name": str,
+        "mesh_min": list,
+        "mesh_max": list,
+        "probed_matrix": list,
+        "mesh_matrix": list,
+        "profiles": dict,
+    },
+    "probe": {"name": str, "last_query": bool, "last_z_result": NUMBER},
+    "screws_tilt_adjust": {"error": bool, "max_deviation": NUMBER_OR_NONE, "results": dict},
+    "bed_screws": {
+        "is_active": bool,
+        "state": TEXT_OR_NONE,
+        "current_screw": (int, type(None)),
+        "accepted_screws": (int, type(None)),
+    },
 }
-"""By object and field: the type, or AXES. A machine has the objects whose sections it has."""
+"""By object and field: the type, or AXES; ``fan_generic`` stands for all objects whose first word it is."""
+
+SECTIONS: Final = """
+[heater_generic chamber]
+heater_pin: PF2
+sensor_type: Generic 3950
+sensor_pin: PF3
+control: watermark
+min_temp: 0
+max_temp: 90
+[temperature_sensor board]
+sensor_type: Generic 3950
+sensor_pin: PF1
+min_temp: 0
+max_temp: 100
+[temperature_fan exhaust]
+pin: PF4
+sensor_type: Generic 3950
+sensor_pin: PF5
+control: watermark
+target_temp: 40
+min_temp: 0
+max_temp: 90
+[fan_generic shelf]
+pin: PF6
+[controller_fan electronics]
+pin: PF8
+[output_pin caselight]
+pin: PF9
+[filament_switch_sensor runout]
+switch_pin: PF10
+[firmware_retraction]
+[save_variables]
+filename: {folder}/variables.cfg
+[probe]
+pin: PF11
+z_offset: 1
+[screws_tilt_adjust]
+screw1: 10, 10
+screw2: 100, 10
+screw3: 50, 100
+[bed_screws]
+screw1: 10, 10
+screw2: 100, 10
+screw3: 50, 100
+"""
+"""What a machine that prints needs beyond its own to have all objects of SCHEMA."""
 
 STATS: Final = frozenset(
     (
@@ -106,17 +209,39 @@ STATS: Final = frozenset(
 def problems(status: dict[str, dict[str, Any]]) -> list[str]:
     """Return what STATUS has otherwise than SCHEMA."""
     found = []
-    for name, fields in SCHEMA.items():
-        for field, kind in fields.items():
-            if field not in status.get(name, {}):
-                found.append(f"{name}.{field} is missing")
-                continue
-            value = status[name][field]
-            good = _is_position(value) if kind is AXES else isinstance(value, kind)
-            if not good:
-                found.append(f"{name}.{field} is {value!r}")
+    for kind, fields in SCHEMA.items():
+        names = [name for name in status if name.partition(" ")[0] == kind]
+        if not names:
+            found.append(f"there is no {kind}")
+        for name in names:
+            found += [
+                f"{name}.{field} is {status[name].get(field, 'missing')!r}"
+                for field, expected in fields.items()
+                if field not in status[name] or not _fits(status[name][field], expected)
+            ]
+        if kind == "mcu":
+            found += [
+                f"{name} has no {STATS - s.keys()}"
+                for name in names
+                if STATS - (s := _stats(status[name])).keys()
+            ]
     return found
 
 
-def _is_position(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 4 and all(isinstance(item, NUMBER) for item in value)
+def _stats(node: dict[str, Any]) -> dict[str, Any]:
+    """Return the statistics of NODE that are numbers."""
+    return {name: value for name, value in node["last_stats"].items() if _fits(value, NUMBER)}
+
+
+def _fits(value: Any, expected: Any) -> bool:
+    if expected is AXES:
+        return isinstance(value, list) and len(value) == 4 and all(_fits(item, NUMBER) for item in value)
+    if expected is LAYERS:
+        return value.keys() == {"total_layer", "current_layer"} and all(
+            _fits(item, (int, type(None))) for item in value.values()
+        )
+    if isinstance(value, bool):
+        return expected is bool
+    if isinstance(value, float):
+        return isinstance(value, expected) and math.isfinite(value)
+    return isinstance(value, expected)

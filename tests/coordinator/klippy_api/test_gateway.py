@@ -9,7 +9,7 @@ import pytest
 
 from coordinator.klippy_api.gateway import BLOCKED_S, CLIENTS_MAX
 from coordinator.klippy_api.wire import MESSAGE_BYTES_MAX
-from tests.coordinator.klippy_api.schema import STATS, problems
+from tests.coordinator.klippy_api import schema
 from tests.stages.klippy_clients import KlippyApi, KlippyClient
 from tests.stages.printer import PRINTING, Printer
 from tests.stages.served import Served
@@ -82,7 +82,7 @@ async def as_moonraker(client: KlippyClient) -> list[str]:
 
 
 def test_what_moonraker_and_a_browser_ask_for(tmp_path: Path) -> None:
-    printer = Printer(tmp_path, SECTIONS)
+    printer = Printer(tmp_path, SECTIONS + schema.SECTIONS.format(folder=tmp_path))
 
     async def main(served: Served) -> None:
         async with KlippyApi.of(served, printer.config) as api:
@@ -93,6 +93,7 @@ def test_what_moonraker_and_a_browser_ask_for(tmp_path: Path) -> None:
             await _check_mesh(client)
             await _check_outputs(client)
             await _check_print(client, served, printer)
+            await _check_dumps(api, client)
             await _check_stop_and_restart(api, client, served)
             assert api.notices == []
 
@@ -101,12 +102,12 @@ def test_what_moonraker_and_a_browser_ask_for(tmp_path: Path) -> None:
 
 async def _check_objects(client: KlippyClient, objects: list[str]) -> None:
     status = await client.watch(dict.fromkeys(objects))
-    assert problems(status) == []
+    assert schema.problems(status) == []
+    asked = await client.ask("objects/query", {"objects": {"extruder": ["can_extrude"]}})
+    assert asked["status"] == {"extruder": {"can_extrude": False}}
     nodes = [name for name in objects if name.partition(" ")[0] == "mcu"]
     assert len(nodes) == 2
     for node in nodes:
-        stats = status[node]["last_stats"]
-        assert stats.keys() >= STATS, STATS - stats.keys()
         assert status[node]["mcu_constants"]["MCU"]
     assert status["gcode_macro SAY"] == {"times": 2}
     assert status["gcode_macro QUIET"] == {}
@@ -150,6 +151,40 @@ async def _check_motion(client: KlippyClient) -> None:
     assert set(ends) == {"x", "y", "z"}
     assert set(ends.values()) <= {"open", "TRIGGERED"}
     assert set((await client.query("query_endstops"))["query_endstops"]["last_query"].values()) <= {0, 1}
+
+
+async def _check_dumps(api: KlippyApi, client: KlippyClient) -> None:
+    """The executed moves, in order and without jumps, from where the head stood to where it stands."""
+    watcher = api.connect()
+    for name in ("toolhead", "extruder"):
+        params = {"name": name, "response_template": {"method": name}}
+        header = (await watcher.ask("motion_report/dump_trapq", params))["header"]
+        assert header == ["time", "duration", "start_velocity", "acceleration", "start_position", "direction"]
+    assert "one of toolhead, extruder" in await client.error("motion_report/dump_trapq", {"name": "x"})
+    begin = (await client.query("toolhead"))["toolhead"]["position"]
+    await client.script("M83", "G1 X100 Y20 E0.5 F3000", "G1 X110 F6000", "G1 E-0.2 F600", "M400")
+    await watcher.updates(0.5)
+    rows: dict[str, list[Any]] = {"toolhead": [], "extruder": []}
+    for event in watcher.events:
+        rows[event["method"]] += event["params"]["data"]
+    _check_rows(rows["toolhead"], begin[:3], [110, 20, begin[2]])
+    assert max(row[2] for row in rows["toolhead"]) == pytest.approx(100, rel=0.01)
+    _check_rows(rows["extruder"], [begin[3], 0, 0], [begin[3] + 0.3, 0, 0])
+    assert {row[5][0] for row in rows["extruder"]} == {1, -1}
+    watcher.transport.close()
+
+
+def _check_rows(rows: list[Any], begin: list[float], end: list[float]) -> None:
+    """Make sure that ROWS of a dump lead from BEGIN to END without jumps."""
+    at, before_s = begin, 0.0
+    for time_s, duration_s, speed, accel, place, direction in rows:
+        assert time_s >= before_s - 1e-9
+        assert place == pytest.approx(at, abs=1e-6)
+        way = (speed + accel * duration_s / 2) * duration_s
+        assert way >= 0
+        at = [value + way * ratio for value, ratio in zip(place, direction, strict=True)]
+        before_s = time_s + duration_s
+    assert at == pytest.approx(end, abs=1e-6)
 
 
 async def _check_mesh(client: KlippyClient) -> None:
@@ -236,8 +271,30 @@ async def _check_print(client: KlippyClient, served: Served, printer: Printer) -
     assert await client.ask("pause_resume/cancel") == {}
     await look("cancelled")
     assert states == ["printing", "paused", "printing", "paused", "cancelled"], "a cancel is no resume"
+    await _check_jobs_in_a_row(client)
     assert [path.name for path in served.jobs.iterdir()] == ["sub"], "front ends list what is in there"
     assert len(list((served.jobs.parent / "state").glob("journal-*"))) == 1
+
+
+async def _check_jobs_in_a_row(client: KlippyClient) -> None:
+    """A job follows another within less than the time between two updates; each state is seen."""
+
+    async def is_in(state: str) -> None:
+        async with asyncio.timeout(60):
+            while (await client.query("print_stats"))["print_stats"]["state"] != state:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)  # faster than updates come
+
+    await client.updates(1.0)
+    for _ in range(2):
+        await client.script('SDCARD_PRINT_FILE FILENAME="sub/part.gcode"')
+        await is_in("printing")
+        assert await client.ask("pause_resume/cancel") == {}
+        await is_in("cancelled")
+    updates = await client.updates(0.3)
+    states = [
+        update["print_stats"]["state"] for update in updates if "state" in update.get("print_stats", {})
+    ]
+    assert states == ["printing", "paused", "cancelled"] * 2, "Moonraker's history has both"
 
 
 async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: Served) -> None:
@@ -275,6 +332,8 @@ async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: 
         objects = (await again.ask("objects/list"))["objects"]
         status = await again.query(*objects)
         assert status["webhooks"]["state"] == "startup"
+        if "mcu" in status and status["mcu"]["mcu_version"]:
+            assert schema.problems(status) == [], "all fields, as clients may watch them from now on"
         seen.add(len(objects))
         await asyncio.sleep(0.05)
     assert seen
