@@ -16,7 +16,7 @@ from nodes.support.errors import CanductorError
 
 _MAGIC: Final = 0x31544E4C50444E43
 _NAME: Final = 64
-_ITEMS: Final = 80
+_ITEMS: Final = 96
 _STEPPERS: Final = 16
 _HISTORY: Final = 4096
 _HEADER: Final = np.dtype(
@@ -47,6 +47,8 @@ class PlantItemKind(IntEnum):
     SWITCH = 5
     TMC = 6
     """A stepper's driver."""
+    COIL = 7
+    """The coil of an eddy current probe, with its chip."""
 
 
 class PlantFault(IntEnum):
