@@ -67,7 +67,7 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
         z, *tilts_ = frame_axes(description, z, settings)
         tilts = tuple(tilts_)
     if pin.sensor:
-        coil = _coil(description, settings, (x, y, z, *tilts), pin.node)
+        coil = _coil(description, settings, (x, y, z, *tilts))
         return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, coil)
     true_z = described.offset[2] if settings.z_offset_mm is None else settings.z_offset_mm
     probe = Probe(
@@ -92,7 +92,7 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
     return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, probe)
 
 
-def _coil(description: MachineDescription, settings: BedSettings, axes: Sequence[Axis], node: str) -> Coil:
+def _coil(description: MachineDescription, settings: BedSettings, axes: Sequence[Axis]) -> Coil:
     """Return the coil of an eddy current probe at NODE; X, Y, Z and perhaps slopes are AXES."""
     described = description.probe
     assert described is not None

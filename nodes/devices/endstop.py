@@ -75,10 +75,10 @@ class Endstop(Device):
 class HomingSensor(Protocol):
     """A sensor that may stand in for an endstop."""
 
-    def home(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
+    def begin_homing(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
         """Trigger the stop group when it sees its threshold, from CLOCK on."""
 
-    def end(self, node: Node) -> None:
+    def end_homing(self, node: Node) -> None:
         """Stop looking."""
 
     async def state(self, node: Node) -> EndstopState:
@@ -104,11 +104,11 @@ class SensorEndstop(Device):
 
     def home(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
         """Trigger the stop group when it sees its threshold, from CLOCK on."""
-        self._sensor.home(node, clock=clock, rest_ticks=rest_ticks, trsync_oid=trsync_oid)
+        self._sensor.begin_homing(node, clock=clock, rest_ticks=rest_ticks, trsync_oid=trsync_oid)
 
     def end(self, node: Node) -> None:
         """Stop looking."""
-        self._sensor.end(node)
+        self._sensor.end_homing(node)
 
     async def state(self, node: Node) -> EndstopState:
         """Return its state; raises CanductorError."""

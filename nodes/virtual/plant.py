@@ -128,9 +128,9 @@ class Probe:
 class Coil:
     """The coil of an eddy current probe with its LDC1612 at ADDRESS of I2C bus number BUS.
 
-    Its frequency, in Hz, is far·(1 + gain·e^(-h / reach))·(1 + drift·(T - 25 °C)), where h is the height of the
-    nozzle above BED at the place of the coil, OFFSET_X, OFFSET_Y from the nozzle. X, Y, Z and the slopes are axes as of
-    a probe; T is the temperature of BODY.
+    Its frequency, in Hz, is far·(1 + gain·e^(-h / reach))·(1 + drift·(T - 25 °C)), where h is the height of
+    the nozzle above BED at the place of the coil, OFFSET_X, OFFSET_Y from the nozzle. X, Y, Z and the slopes
+    are axes as of a probe; T is the temperature of BODY.
     """
 
     name: str

@@ -151,7 +151,15 @@ class ProbePoints:
         """Measure all places (or PLACES) in turn; None: it is only planned. It ends at travel HEIGHT."""
         height = self.height(command) if height is None else height
         if probe.scans and how.method != AUTOMATIC[0]:
-            return (yield from self._scan(job, command, probe, how, height, places))
+            travels = [
+                partial(self.travel, job, probe, place, height, how.lift_speed)
+                for place in (self.places if places is None else places)
+            ]
+            yield from probe.deploy(job, command)
+            scanned = yield from probe.scan(job, command, how, travels)
+            if scanned is not None:
+                yield from probe.stow(job, command)
+            return scanned
         found = []
         yield from probe.deploy(job, command)
         for place in self.places if places is None else places:
@@ -161,27 +169,6 @@ class ProbePoints:
                 return None
             found.append(measured)
         yield from lift(job, height, how.lift_speed)
-        yield from probe.stow(job, command)
-        return found
-
-    def _scan(
-        self,
-        job: ProgramContext,
-        command: Command,
-        probe: Probe,
-        how: Measuring,
-        height: float,
-        places: Sequence[Place] | None,
-    ) -> Generator[Reading, None, list[Measured] | None]:
-        """Measure all places at HEIGHT, without a way down; None: it is only planned."""
-        travels = [
-            partial(self.travel, job, probe, place, height, how.lift_speed)
-            for place in (self.places if places is None else places)
-        ]
-        yield from probe.deploy(job, command)
-        found = yield from probe.scan(job, command, how, travels)
-        if found is None:
-            return None
         yield from probe.stow(job, command)
         return found
 

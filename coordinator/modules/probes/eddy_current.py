@@ -212,11 +212,11 @@ class EddyProbe(Probe):
 
     # ------------------------------------------------------------------------------------- as an endstop
 
-    def home(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
+    def begin_homing(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
         """Trigger the stop group when the coil is at descend_z."""
         self._sensor.home(node, clock=clock, rest_ticks=rest_ticks, trsync_oid=trsync_oid)
 
-    def end(self, node: Node) -> None:
+    def end_homing(self, node: Node) -> None:
         """Stop comparing readings."""
         self._sensor.end(node)
 
