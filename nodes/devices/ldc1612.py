@@ -33,6 +33,8 @@ STATUS_S: Final = 0.1
 """Between two questions for the number of readings, which give their times."""
 PATIENCE_S: Final = 1.0
 """For readings that are waited for."""
+TRIES: Final = 3
+"""Of a transfer whose answer was of another one."""
 AUTO_S: Final = 0.1
 """The chip's own search for its drive current, several conversions."""
 SCALE: Final = 1 << 28
@@ -105,7 +107,8 @@ class Ldc1612(Device):
         self._divider = max(1, math.ceil(4 * max_sensor_hz / clock_hz))
         self._i2c_oid = 0
         self._users = 0
-        self._overflow = False
+        self._listening = False
+        self._sequence = 0
         self._came = asyncio.Event()
         self._rest_ticks = 1
         self._homing_rest_ticks = 0
@@ -162,17 +165,22 @@ class Ldc1612(Device):
         await self._transfer(node, bytes((register, value >> 8, value & 0xFF)), 0)
 
     async def _transfer(self, node: Node, content: bytes, size: int) -> bytes:
-        answer = await node.query(
-            "i2c_transfer", "i2c_response", oid=self._i2c_oid, write=content, read_len=size
-        )
-        if answer.integer("i2c_bus_status"):
-            raise SensorError(ERRORS[1])
-        return answer.data("response")
+        for _ in range(TRIES):
+            answer = await node.query(
+                "i2c_transfer", "i2c_response", oid=self._i2c_oid, write=content, read_len=size
+            )
+            if answer.integer("i2c_bus_status"):
+                raise SensorError(ERRORS[1])
+            # Another size is of an earlier transfer, whose answer was slow and was asked for again.
+            if len(found := answer.data("response")) == size:
+                return found
+        raise SensorError(ERRORS[1])
 
     async def check(self, node: Node) -> None:
         """Raise SensorError where there is no LDC1612."""
         for register, wanted in (_MANUFACTURER, _DEVICE):
-            if await self.read(node, register) != wanted:
+            found = [await self.read(node, register) for _ in range(TRIES)]
+            if wanted not in found:
                 raise SensorError("what answers at i2c_address is no LDC1612: check i2c_address")
 
     async def set_up(self, node: Node, *, drive: int | None) -> None:
@@ -219,17 +227,27 @@ class Ldc1612(Device):
                 " LDC_CALIBRATE_DRIVE_CURRENT"
             )
         await self.set_up(node, drive=self.drive)
-        self.readings, self.counts, self._overflow = [], [], False
+        self._listening = False
         node.send("query_ldc1612", oid=self._oid, rest_ticks=self._rest_ticks)
+        # What comes from now on is no message that was on its way before.
+        self._sequence, self.readings, self.counts = 0, [], []
         await self.count(node)
+        self._listening = True
 
     def _take(self, message: Message) -> None:
-        data, first = message.data("data"), len(self.readings)
-        if message.integer("sequence") * READINGS % (READINGS << 16) != first % (READINGS << 16):
+        """Take a message of readings; others may have been lost before it."""
+        if not self._listening:
             return  # of an earlier round
+        data = message.data("data")
+        self._sequence = self._whole(message.integer("sequence"))
         for at in range(0, len(data) - 3, 4):
-            self.readings.append(self._reading(first + at // 4, int.from_bytes(data[at : at + 4], "big")))
+            number = self._sequence * READINGS + at // 4
+            self.readings.append(self._reading(number, int.from_bytes(data[at : at + 4], "big")))
         self._came.set()
+
+    def _whole(self, sequence: int) -> int:
+        """Return which number SEQUENCE (16 bits) stands for: the nearest one to the last."""
+        return self._sequence + (sequence - self._sequence + (1 << 15)) % (1 << 16) - (1 << 15)
 
     def _reading(self, number: int, value: int) -> Reading:
         if value >= LOST:
@@ -245,17 +263,19 @@ class Ldc1612(Device):
             raise SensorError(
                 "readings were lost, as the node could not send them: check the bus for errors and load"
             )
-        turns = (len(self.readings) // READINGS - answer.integer("next_sequence") + (1 << 15)) >> 16
-        count = (answer.integer("next_sequence") + (turns << 16)) * READINGS + answer.integer("buffered") // 4
+        count = self._whole(answer.integer("next_sequence")) * READINGS + answer.integer("buffered") // 4
         self.counts.append((answer.integer("clock"), count))
         return count
 
     async def next_readings(self, node: Node, size: int) -> list[Reading]:
-        """Return SIZE readings that begin from now on; raises SensorError for a bad one or none."""
+        """Return SIZE readings that begin from now on; raises SensorError for a bad one or none.
+
+        Messages may get lost on the way, so they need not follow each other.
+        """
         first = await self.count(node) + 1  # the one that is being made may have begun before
         try:
             async with asyncio.timeout(PATIENCE_S + size / RATE_HZ):
-                while len(self.readings) < first + size:
+                while len(found := [one for one in self.readings if one.number >= first]) < size:
                     self._came.clear()
                     await self._came.wait()
         except TimeoutError:
@@ -263,7 +283,7 @@ class Ldc1612(Device):
             if node_failure is not None:
                 raise node_failure.with_traceback(None) from None
             raise SensorError(ERRORS[3]) from None
-        return checked(self.readings[first : first + size])
+        return checked(found[:size])
 
     # -------------------------------------------------------------------------------------------- homing
 

@@ -95,6 +95,7 @@ _FAULTS: Final[Mapping[PlantItemKind, tuple[PlantFault, ...]]] = {
         PlantFault.WARM,
         PlantFault.OVERHEATED,
     ),
+    PlantItemKind.COIL: (PlantFault.OPEN, PlantFault.DEAD, PlantFault.SHORTED),
 }
 
 
@@ -117,7 +118,7 @@ class Item:
     fault: PlantFault
     value: float
     """Body: °C; heater, fan: duty, 0 to 1; sensor: its own °C; switch: 1: pressed; driver: true time (ns)
-    until which its DIAG is high if no step follows."""
+    until which its DIAG is high if no step follows; coil: Hz of its last reading."""
     extra: float
     """Heater: J delivered so far; fan: revolutions; sensor: last sample; switch: number of changes; driver:
     SG_RESULT."""

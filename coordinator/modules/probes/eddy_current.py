@@ -45,7 +45,7 @@ from coordinator.modules.probes.probe_commands import ProbeCommands
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.probing import place_by_steps
 from nodes.devices.endstop import EndstopState, SensorEndstop
-from nodes.devices.ldc1612 import STATUS_S, Ldc1612, checked
+from nodes.devices.ldc1612 import STATUS_S, Ldc1612, SensorError, checked
 from nodes.devices.ldc1612 import Reading as CoilReading
 from nodes.node.node import Node
 from nodes.support.errors import CanductorError
@@ -59,6 +59,8 @@ TRAVEL_SPEED: Final = 50.0
 """mm/s, of a calibration's way from the nozzle to the coil."""
 NEAR: Final = 2
 """Readings before and after a place that a scan in flight passes: with them its height is found."""
+GAP_S: Final = 0.03
+"""From a place to the nearest reading: one message may be lost."""
 RANGE_HZ: Final = (100_000.0, 40_000_000.0)
 
 SENSOR_TYPE: Final = ChoiceOption(name="sensor_type", help="the chip", choices=("ldc1612",))
@@ -428,6 +430,9 @@ class EddyProbe(Probe):
         return Done((f"{self.name}: {found}; SAVE_CONFIG writes it",))
 
 
+Numbers = np.ndarray[Any, np.dtype[np.float64]]
+
+
 class _Flight:
     """The readings of a scan in flight by PROBE, and when each was made."""
 
@@ -456,14 +461,11 @@ class _Flight:
         try:
             with probe._explained():  # noqa: SLF001
                 await sensor.next_readings(probe.node, READINGS)
-                readings = list(sensor.readings)
-                checked(readings)
-                times = self._times(readings)
+                readings = checked(list(sensor.readings))
+                at_s = self._times(readings)
                 table = probe.calibrated()
-                found = [
-                    height_at(time_s, times, [table.height(reading.frequency_hz) for reading in near])
-                    for time_s, times, near in (_near(time_s, times, readings) for time_s in passed)
-                ]
+                heights = [table.height(reading.frequency_hz) for reading in readings]
+                found = [height_at(time_s - at_s, heights) for time_s in passed]
         finally:
             await self.end()
         return found
@@ -476,7 +478,7 @@ class _Flight:
                 await self._asking
         await self._stack.aclose()
 
-    def _times(self, readings: Sequence[CoilReading]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def _times(self, readings: Sequence[CoilReading]) -> Numbers:
         """Return the print times of the middles of the conversions."""
         probe = self._probe
         sensor = probe._sensor  # noqa: SLF001
@@ -486,19 +488,17 @@ class _Flight:
         counts = np.array([count for _, count in sensor.counts], dtype=np.float64)
         period_s, begin_s = np.polyfit(counts, clocks, 1)
         # When COUNT readings are there, the last of them ended half a conversion before, on average.
-        return np.asarray(begin_s + period_s * np.arange(len(readings), dtype=np.float64), dtype=np.float64)
+        numbers = np.array([reading.number for reading in readings], dtype=np.float64)
+        return np.asarray(begin_s + period_s * numbers, dtype=np.float64)
 
 
-def _near(
-    time_s: float, times: np.ndarray[Any, np.dtype[np.float64]], readings: Sequence[CoilReading]
-) -> tuple[float, np.ndarray[Any, np.dtype[np.float64]], Sequence[CoilReading]]:
-    middle = int(np.argmin(np.abs(times - time_s)))
-    first, last = max(0, middle - NEAR), min(len(readings), middle + NEAR + 1)
-    return time_s, times[first:last], readings[first:last]
+def height_at(after_s: Numbers, heights: Sequence[float]) -> float:
+    """Return the height at a time by a straight line through the HEIGHTS (mm) nearest to it.
 
-
-def height_at(time_s: float, times: np.ndarray[Any, np.dtype[np.float64]], heights: Sequence[float]) -> float:
-    """Return the height at a time, by a straight line through HEIGHTS at TIMES, s and mm."""
-    slope, at = np.polyfit(times - time_s, heights, 1)
-    del slope
-    return float(at)
+    AFTER_S: how long it is after each of them, which are in order. Raises SensorError when none is near.
+    """
+    middle = int(np.argmin(np.abs(after_s)))
+    near = slice(max(0, middle - NEAR), middle + NEAR + 1)
+    if abs(after_s[middle]) > GAP_S:
+        raise SensorError("readings were lost on the way to the host: check the bus for errors and load")
+    return float(np.polyfit(-after_s[near], heights[near], 1)[1])
