@@ -1,7 +1,7 @@
 """[probe_eddy_current] on a virtual bed in virtual time, by the node's firmware and a chip on an I2C bus.
 
-The reference clock of the chip is off by 0.02 %, as a crystal may be, and the calibration has that in it. Where
-the calibration is not what is tested it is computed by the formula of docs/plant.md.
+The reference clock of the chip is off by 0.02 %, as a crystal may be, and the calibration has that in it.
+Where the calibration is not what is tested it is computed by the formula of docs/plant.md.
 """
 
 import json
@@ -204,7 +204,7 @@ def test_frequencies_beyond_the_calibration_are_refused(tmp_path: Path) -> None:
     ],
 )
 def test_nothing_moves_before_it_is_calibrated(
-    tmp_path: Path, options: dict[str, object], sentence: str
+    tmp_path: Path, options: dict[str, Any], sentence: str
 ) -> None:
     stage = stage_with(tmp_path, **options)
     assert sentence in failure(stage, "G28")
