@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.config.errors import ConfigError
 from coordinator.virtual_machine.plant_bed import BedSettings
 from nodes.virtual.plant import Bed
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
@@ -128,7 +129,47 @@ def test_scans_find_the_bed_standing_and_in_flight(tmp_path: Path) -> None:
     assert np.diff(flight).max() < 0.02, "the head never stood at a place"
 
 
+def test_the_bus_the_chip_and_the_height_are_as_configured(tmp_path: Path) -> None:
+    """The plant has the same chip there, and nothing elsewhere; the clock of 40 MHz needs no division."""
+    options = {"i2c_bus": "i2c2", "i2c_address": 43, "i2c_speed": 100000, "frequency": 40000000}
+    stage = stage_with(tmp_path, **options, max_sensor_hz=9000000, z_offset=0.8, intb_pin="toolhead:PC6")
+    output = stage.do("G28", "QUERY_PROBE")
+    assert output == ["probe: TRIGGERED"]
+    assert abs(zero_error(stage)) < MICROSTEP_MM
+    assert stage.true_mm("z") - coil_height(0, 0) == pytest.approx(0.8, abs=0.06)
+
+
 # ----------------------------------------------------------------------------------------------- what fails
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"i2c_mcu": "hotend"}, "there is no node of that name; add [mcu hotend]"),
+        ({"intb_pin": "PC6"}, "it has to be one of node toolhead, as the bus is"),
+        ({"descend_z": 0.4, "z_offset": 0.4}, "descend_z and z_offset mean the same; remove z_offset"),
+        ({"z_offset": -0.1}, "the nozzle must not touch the bed; it must be above 0"),
+        ({"calibrate": "0.1:3000, 0.2:3100, 0.3:2900, 0.4:2800"}, "as saved by a calibration"),
+        ({"sensor_type": "ldc1614"}, "ldc1612"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(tmp_path: Path, options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        stage_with(tmp_path, **options)
+    assert sentence in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("Z_OFFSET_APPLY_PROBE", "come from PROBE_EDDY_CURRENT_CALIBRATE: calibrate again"),
+        ("PROBE_CALIBRATE", "come from PROBE_EDDY_CURRENT_CALIBRATE: calibrate again"),
+        ("LDC_CALIBRATE_DRIVE_CURRENT CHIP=other", "CHIP of LDC_CALIBRATE_DRIVE_CURRENT is 'other'"),
+        ("PROBE_EDDY_CURRENT_CALIBRATE", "PROBE_EDDY_CURRENT_CALIBRATE comes before Z is homed"),
+    ],
+)
+def test_commands_that_do_not_fit_are_refused(tmp_path: Path, line: str, sentence: str) -> None:
+    assert sentence in failure(stage_with(tmp_path), line)
 
 
 def failure(stage: ProbeStage, *lines: str) -> str:

@@ -131,14 +131,15 @@ class EddyProbe(Probe):
         self._manual = build.shared(ManualProbe)
         self._machine = build.machine
         self.instance = build.instance
-        self._node = build.get(I2C_MCU)
-        if self._node not in (node.name for node in build.machine.nodes):
-            raise build.reader.bad(I2C_MCU, f"but there is no node of that name; add [mcu {self._node}]")
+        """Its name, which CHIP= of commands takes."""
+        self.node_name = build.get(I2C_MCU)
+        if self.node_name not in (node.name for node in build.machine.nodes):
+            raise build.reader.bad(I2C_MCU, f"but there is no node of that name; add [mcu {self.node_name}]")
         build.get(SENSOR_TYPE)
         intb = build.find_pin(INTB)
-        if intb is not None and intb.node != self._node:
-            raise build.reader.bad(INTB, f"but it has to be one of node {self._node}, as the bus is")
-        self._sensor = Ldc1612(
+        if intb is not None and intb.node != self.node_name:
+            raise build.reader.bad(INTB, f"but it has to be one of node {self.node_name}, as the bus is")
+        self.sensor = Ldc1612(
             f"[{build.name}]",
             bus=build.get(BUS),
             address=build.get(ADDRESS),
@@ -147,9 +148,9 @@ class EddyProbe(Probe):
             max_sensor_hz=build.get(MAX_SENSOR),
             intb_pin="" if intb is None else intb.name,
         )
-        self._sensor.drive = build.find(DRIVE)
+        self.sensor.drive = build.find(DRIVE)
         self.table: EddyTable | None = build.find(CALIBRATE)
-        build.add_device(self._node, self._sensor, intb)
+        build.add_device(self.node_name, self.sensor, intb)
         for name, text, read in (
             (
                 "LDC_CALIBRATE_DRIVE_CURRENT",
@@ -183,11 +184,11 @@ class EddyProbe(Probe):
             endstop = live.machine.devices.endstops[described.rail.axis]
             assert isinstance(endstop, SensorEndstop)
             endstop.sensor = self
-        with self._explained():
-            await self._sensor.check(live.node(self._node))
+        with self.explained():
+            await self.sensor.check(live.node(self.node_name))
 
     @contextlib.contextmanager
-    def _explained(self) -> Iterator[None]:
+    def explained(self) -> Iterator[None]:
         """Have errors of the sensor begin with the section's name."""
         try:
             yield
@@ -201,7 +202,7 @@ class EddyProbe(Probe):
     @property
     def node(self) -> Node:
         """The node of the chip; raises CanductorError before ``connect``."""
-        return self.live.node(self._node)
+        return self.live.node(self.node_name)
 
     def calibrated(self) -> EddyTable:
         """Return the calibration; raises NotReadyError when there is none."""
@@ -212,48 +213,55 @@ class EddyProbe(Probe):
             )
         return self.table
 
+    def check_offset(self, command: Command) -> None:
+        """Raise WordError: a wrong height is one of the calibration."""
+        raise WordError(
+            f"{command.name} is for probes with a z_offset; the heights of [{self.name}] come from"
+            " PROBE_EDDY_CURRENT_CALIBRATE: calibrate again"
+        )
+
     # ------------------------------------------------------------------------------------- as an endstop
 
     def begin_homing(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
         """Trigger the stop group when the coil is at descend_z."""
-        self._sensor.home(node, clock=clock, rest_ticks=rest_ticks, trsync_oid=trsync_oid)
+        self.sensor.home(node, clock=clock, rest_ticks=rest_ticks, trsync_oid=trsync_oid)
 
     def end_homing(self, node: Node) -> None:
         """Stop comparing readings."""
-        self._sensor.end(node)
+        self.sensor.end(node)
 
     async def state(self, node: Node) -> EndstopState:
         """Measure whether it is triggered; raises CanductorError."""
-        with self._explained():
-            self._sensor.threshold_hz = self.calibrated().frequency(self.offset[2])
-            return await self._sensor.state(node)
+        with self.explained():
+            self.sensor.threshold_hz = self.calibrated().frequency(self.offset[2])
+            return await self.sensor.state(node)
 
     def touching(self, *, alone: bool) -> AbstractAsyncContextManager[None]:
         """Return what has the coil read while the head is lowered."""
         del alone
-        return self._sampling()
+        return self.sampling()
 
     @asynccontextmanager
-    async def _sampling(self) -> AsyncIterator[None]:
+    async def sampling(self) -> AsyncIterator[None]:
         """Have the coil read meanwhile; raises NotReadyError where that cannot begin."""
         self.calibrated()
         async with contextlib.AsyncExitStack() as stack:
-            with self._explained():
-                await stack.enter_async_context(self._sensor.sampling(self.node))
+            with self.explained():
+                await stack.enter_async_context(self.sensor.sampling(self.node))
             yield
 
     async def standing_mm(self) -> float:
         """Measure how high the nozzle is above the bed below the coil; raises NotReadyError."""
         frequency = await self.frequency()
-        with self._explained():
+        with self.explained():
             return self.calibrated().height(frequency)
 
     async def frequency(self) -> float:
         """Measure the frequency of the coil where the head stands, Hz; raises NotReadyError."""
-        with self._explained():
-            async with self._sensor.sampling(self.node):
+        with self.explained():
+            async with self.sensor.sampling(self.node):
                 await asyncio.sleep(SETTLE_S)
-                readings = await self._sensor.next_readings(self.node, READINGS)
+                readings = await self.sensor.next_readings(self.node, READINGS)
         return statistics.fmean(reading.frequency_hz for reading in readings)
 
     # --------------------------------------------------------------------------------------------- scans
@@ -301,17 +309,6 @@ class EddyProbe(Probe):
         passed: list[float] = []
         found: list[Measured] = []
         flight = _Flight(self)
-        # The first place is where the head stands when the readings begin.
-        yield from travels[0]()
-        yield AtStandstill(self._beginning(command, flight))
-        if not flight.began:
-            return None
-        for number, travel in enumerate(travels):
-            if number:
-                yield from travel()
-            x, y, _, _ = job.call(command).position
-            places.append((x, y))
-            yield Synchronized(passed.append)
 
         async def evaluate() -> Done:
             async with self._failing(command):
@@ -320,7 +317,21 @@ class EddyProbe(Probe):
                 found.append(await self._scanned(x, y, height))
             return Done(tuple(map(self._told, found)))
 
-        yield AtStandstill(evaluate)
+        # The first place is where the head stands when the readings begin.
+        yield from travels[0]()
+        yield AtStandstill(self._beginning(command, flight))
+        if not flight.began:
+            return None
+        try:
+            for number, travel in enumerate(travels):
+                if number:
+                    yield from travel()
+                x, y, _, _ = job.call(command).position
+                places.append((x, y))
+                yield Synchronized(passed.append)
+            yield AtStandstill(evaluate)
+        finally:  # also where the program is cancelled
+            self.live.soon_on_loop(flight.abandon)
         return found or None
 
     def _beginning(self, command: Command, flight: "_Flight") -> "Callable[[], Any]":
@@ -368,9 +379,9 @@ class EddyProbe(Probe):
         self._check_chip(call)
 
         async def find() -> Done:
-            with self._explained():
-                drive = await self._sensor.find_drive(self.node)
-            self._sensor.drive = drive
+            with self.explained():
+                drive = await self.sensor.find_drive(self.node)
+            self.sensor.drive = drive
             self.live.save(self.name, DRIVE.name, str(drive))
             return Done((f"{self.name}: reg_drive_current: {drive}; SAVE_CONFIG writes it",))
 
@@ -440,27 +451,43 @@ class _Flight:
         self._probe = probe
         self._stack = contextlib.AsyncExitStack()
         self._asking: asyncio.Task[None] | None = None
+        self._counted: list[tuple[float, int]] = []
+        """Print times, s, and how many readings there were."""
+        self._ending: asyncio.Task[None] | None = None
         self.began = False
 
     async def begin(self) -> None:
         """Begin to read; raises CanductorError."""
-        await self._stack.enter_async_context(self._probe._sampling())  # noqa: SLF001
+        await self._stack.enter_async_context(self._probe.sampling())
         self.began = True
         self._asking = asyncio.create_task(self._ask())
 
     async def _ask(self) -> None:
         with contextlib.suppress(CanductorError):
             while True:
-                await self._probe._sensor.count(self._probe.node)  # noqa: SLF001
+                await self._count()
                 await asyncio.sleep(STATUS_S)
+
+    async def _count(self) -> None:
+        """Note how many readings there are, and when: the node's clock of 32 bits is soon ambiguous."""
+        count = await self._probe.sensor.count(self._probe.node)
+        clock, _ = self._probe.sensor.counts[-1]
+        self._counted.append((self._probe.live.print_time_of(self._probe.node_name, clock), count))
+
+    def abandon(self) -> None:
+        """End it without a result, unless it has ended; on the control loop."""
+        if self._asking is not None:
+            self._ending = asyncio.create_task(self.end())
 
     async def heights(self, passed: Sequence[float]) -> list[float]:
         """End it; return the heights at the print times PASSED, mm; raises CanductorError."""
         probe = self._probe
-        sensor = probe._sensor  # noqa: SLF001
+        sensor = probe.sensor
         try:
-            with probe._explained():  # noqa: SLF001
+            with probe.explained():
+                await self._count()
                 await sensor.next_readings(probe.node, READINGS)
+                await self._count()
                 readings = checked(list(sensor.readings))
                 at_s = self._times(readings)
                 table = probe.calibrated()
@@ -472,21 +499,17 @@ class _Flight:
 
     async def end(self) -> None:
         """End the readings."""
-        if self._asking is not None:
-            self._asking.cancel()
+        asking, self._asking = self._asking, None
+        if asking is not None:
+            asking.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await self._asking
+                await asking
         await self._stack.aclose()
 
     def _times(self, readings: Sequence[CoilReading]) -> Numbers:
         """Return the print times of the middles of the conversions."""
-        probe = self._probe
-        sensor = probe._sensor  # noqa: SLF001
-        clocks = np.array(
-            [probe.live.print_time_of(probe._node, clock) for clock, _ in sensor.counts]  # noqa: SLF001
-        )
-        counts = np.array([count for _, count in sensor.counts], dtype=np.float64)
-        period_s, begin_s = np.polyfit(counts, clocks, 1)
+        clocks_s, counts = np.array(self._counted).T
+        period_s, begin_s = np.polyfit(counts, clocks_s, 1)
         # When COUNT readings are there, the last of them ended half a conversion before, on average.
         numbers = np.array([reading.number for reading in readings], dtype=np.float64)
         return np.asarray(begin_s + period_s * numbers, dtype=np.float64)

@@ -270,6 +270,9 @@ class Probe(ProbeEndstop):
         if "Z" not in call.homed:
             raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
 
+    def check_offset(self, command: Command) -> None:
+        """Raise WordError where COMMAND, which finds a z_offset, does not apply to this kind of probe."""
+
     async def is_triggered(self) -> bool:
         """Return whether its node sees it triggered now; raises CanductorError."""
         machine = self.live.machine
