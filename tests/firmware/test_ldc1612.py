@@ -49,7 +49,7 @@ def reading_host(*, intb: bool = False, wake: bool = True) -> ReadingHost:
 
 
 def ms(host: Host, count: float) -> int:
-    return round(count * 1e-3 * host.words.raw["config"]["CLOCK_FREQ"])
+    return round(count * 1e-3 * host.node.clock_freq)
 
 
 def query(host: Host) -> None:
@@ -68,6 +68,12 @@ def fault(host: ReadingHost, what: PlantFault) -> None:
     host.plant.page.set_fault(PlantItemKind.COIL, "probe", what)
 
 
+def bytes_of(answer: Answer) -> bytes:
+    data = answer.args["data"]
+    assert isinstance(data, bytes)
+    return data
+
+
 def triggers(said: list[Answer]) -> list[int]:
     return [answer["trigger_reason"] for answer in said if answer.name == "trsync_state"]
 
@@ -78,7 +84,7 @@ def test_readings_come_in_bulk_each_once_and_the_status_counts_them(intb: bool) 
     query(host)
     said = host.run(ms(host, 1000))
     assert [answer["sequence"] for answer in said] == list(range(len(said)))
-    data = b"".join(answer.args["data"] for answer in said)
+    data = b"".join(bytes_of(answer) for answer in said)
     values = [int.from_bytes(data[at : at + 4], "big") for at in range(0, len(data), 4)]
     assert 230 <= len(values) <= 250
     assert [value * COUNT for value in values] == pytest.approx([FREQUENCY] * len(values), abs=COUNT)
