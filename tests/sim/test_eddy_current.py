@@ -131,13 +131,9 @@ def test_scans_find_the_bed_standing_and_in_flight(tmp_path: Path) -> None:
 
 def test_the_bus_the_chip_and_the_height_are_as_configured(tmp_path: Path) -> None:
     """The plant has the same chip there, and nothing elsewhere; the clock of 40 MHz needs no division."""
-    options: dict[str, Any] = {
-        "i2c_bus": "i2c2",
-        "i2c_address": 43,
-        "i2c_speed": 100000,
-        "frequency": 40000000,
-    }
-    stage = stage_with(tmp_path, **options, max_sensor_hz=9000000, z_offset=0.8, intb_pin="toolhead:PC6")
+    bus: dict[str, Any] = {"i2c_bus": "i2c2", "i2c_address": 43, "i2c_speed": 100000}
+    chip: dict[str, Any] = {"frequency": 40000000, "max_sensor_hz": 9000000, "intb_pin": "toolhead:PC6"}
+    stage = stage_with(tmp_path, **bus, **chip, z_offset=0.8)
     output = stage.do("G28", "QUERY_PROBE")
     assert output == ["probe: TRIGGERED"]
     assert abs(zero_error(stage)) < MICROSTEP_MM
