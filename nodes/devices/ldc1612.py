@@ -210,17 +210,34 @@ class Ldc1612(Device):
     @asynccontextmanager
     async def sampling(self, node: Node) -> AsyncIterator[None]:
         """Have readings come meanwhile; raises SensorError."""
+        await self.begin(node)
+        try:
+            yield
+        finally:
+            self.end(node)
+
+    @property
+    def is_sampling(self) -> bool:
+        """Whether readings come."""
+        return self._users > 0
+
+    async def begin(self, node: Node) -> None:
+        """Have readings come until ``end``, which is called as often as this; raises SensorError."""
         self._users += 1
         try:
             if self._users == 1:
-                await self._begin(node)
-            yield
-        finally:
-            self._users -= 1
-            if not self._users and node.talks:
-                node.send("query_ldc1612", oid=self._oid, rest_ticks=0)
+                await self._start(node)
+        except BaseException:
+            self.end(node)
+            raise
 
-    async def _begin(self, node: Node) -> None:
+    def end(self, node: Node) -> None:
+        """Have no more readings come, unless somebody else needs them."""
+        self._users -= 1
+        if not self._users and node.talks:
+            node.send("query_ldc1612", oid=self._oid, rest_ticks=0)
+
+    async def _start(self, node: Node) -> None:
         if self.drive is None:
             raise SensorError(
                 "its drive current is not known: hold the head 20 mm above the bed and send"
@@ -287,7 +304,7 @@ class Ldc1612(Device):
 
     # -------------------------------------------------------------------------------------------- homing
 
-    def home(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
+    def begin_homing(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
         """Trigger the stop group at the first reading above the threshold, from CLOCK on."""
         self._homing_rest_ticks = rest_ticks
         node.send(
@@ -300,7 +317,7 @@ class Ldc1612(Device):
             error_reason=int(TriggerReason.SENSOR_BAD),
         )
 
-    def end(self, node: Node) -> None:
+    def end_homing(self, node: Node) -> None:
         """Stop comparing its readings."""
         node.send(
             "ldc1612_setup_home",

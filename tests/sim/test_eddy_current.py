@@ -13,7 +13,11 @@ import numpy as np
 import pytest
 
 from coordinator.config.errors import ConfigError
+from coordinator.gcode.errors import GCodeError
+from coordinator.modules.probes.eddy_current import EddyProbe
+from coordinator.runtime.machine import Machine
 from coordinator.virtual_machine.plant_bed import BedSettings
+from nodes.devices.ldc1612 import Ldc1612
 from nodes.virtual.plant import Bed
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.profiles import is_full
@@ -228,6 +232,22 @@ def test_a_sensor_that_fails_in_flight_ends_the_scan(tmp_path: Path) -> None:
     said = failure(stage, "G28", "BED_MESH_CALIBRATE METHOD=rapid_scan")
     assert "BED_MESH_CALIBRATE failed: [probe_eddy_current coil]: the sensor makes no readings" in said
     assert said.endswith("Z is 2.000 mm")
+
+
+def test_a_scan_that_ends_early_ends_its_readings(tmp_path: Path) -> None:
+    """The last place of a row is out of reach, which is found on the way."""
+    mesh = MESH.replace("180, 170", "230, 170")
+    stage = stage_with(tmp_path, sections=mesh)
+    sensors: list[Ldc1612] = []
+
+    def ready(machine: Machine) -> None:
+        sensors.extend(probe.sensor for probe in machine.modules.of(EddyProbe))
+
+    with pytest.raises(GCodeError, match="the move goes to X 210 mm"):
+        stage.do("G28", "BED_MESH_CALIBRATE METHOD=rapid_scan", on_ready=ready)
+    (sensor,) = sensors
+    assert sensor.readings, "it had begun"
+    assert not sensor.is_sampling
 
 
 def test_frequencies_beyond_the_calibration_are_refused(tmp_path: Path) -> None:

@@ -149,6 +149,7 @@ class EddyProbe(Probe):
             intb_pin="" if intb is None else intb.name,
         )
         self.sensor.drive = build.find(DRIVE)
+        self._flight: _Flight | None = None
         self.table: EddyTable | None = build.find(CALIBRATE)
         build.add_device(self.node_name, self.sensor, intb)
         for name, text, read in (
@@ -187,6 +188,12 @@ class EddyProbe(Probe):
         with self.explained():
             await self.sensor.check(live.node(self.node_name))
 
+    def end(self, cause: str) -> None:
+        """End the readings of a scan that was cut short."""
+        del cause
+        if self._flight is not None:
+            self._flight.end()
+
     @contextlib.contextmanager
     def explained(self) -> Iterator[None]:
         """Have errors of the sensor begin with the section's name."""
@@ -224,11 +231,11 @@ class EddyProbe(Probe):
 
     def begin_homing(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
         """Trigger the stop group when the coil is at descend_z."""
-        self.sensor.home(node, clock=clock, rest_ticks=rest_ticks, trsync_oid=trsync_oid)
+        self.sensor.begin_homing(node, clock=clock, rest_ticks=rest_ticks, trsync_oid=trsync_oid)
 
     def end_homing(self, node: Node) -> None:
         """Stop comparing readings."""
-        self.sensor.end(node)
+        self.sensor.end_homing(node)
 
     async def state(self, node: Node) -> EndstopState:
         """Measure whether it is triggered; raises CanductorError."""
@@ -308,7 +315,7 @@ class EddyProbe(Probe):
         places: list[tuple[float, float]] = []
         passed: list[float] = []
         found: list[Measured] = []
-        flight = _Flight(self)
+        flight = self._flight = _Flight(self)
 
         async def evaluate() -> Done:
             async with self._failing(command):
@@ -331,7 +338,7 @@ class EddyProbe(Probe):
                 yield Synchronized(passed.append)
             yield AtStandstill(evaluate)
         finally:  # also where the program is cancelled
-            self.live.soon_on_loop(flight.abandon)
+            self.live.soon_on_loop(flight.end)
         return found or None
 
     def _beginning(self, command: Command, flight: "_Flight") -> "Callable[[], Any]":
@@ -449,16 +456,16 @@ class _Flight:
 
     def __init__(self, probe: EddyProbe) -> None:
         self._probe = probe
-        self._stack = contextlib.AsyncExitStack()
         self._asking: asyncio.Task[None] | None = None
         self._counted: list[tuple[float, int]] = []
         """Print times, s, and how many readings there were."""
-        self._ending: asyncio.Task[None] | None = None
         self.began = False
 
     async def begin(self) -> None:
         """Begin to read; raises CanductorError."""
-        await self._stack.enter_async_context(self._probe.sampling())
+        self._probe.calibrated()
+        with self._probe.explained():
+            await self._probe.sensor.begin(self._probe.node)
         self.began = True
         self._asking = asyncio.create_task(self._ask())
 
@@ -473,11 +480,6 @@ class _Flight:
         count = await self._probe.sensor.count(self._probe.node)
         clock, _ = self._probe.sensor.counts[-1]
         self._counted.append((self._probe.live.print_time_of(self._probe.node_name, clock), count))
-
-    def abandon(self) -> None:
-        """End it without a result, unless it has ended; on the control loop."""
-        if self._asking is not None:
-            self._ending = asyncio.create_task(self.end())
 
     async def heights(self, passed: Sequence[float]) -> list[float]:
         """End it; return the heights at the print times PASSED, mm; raises CanductorError."""
@@ -494,17 +496,15 @@ class _Flight:
                 heights = [table.height(reading.frequency_hz) for reading in readings]
                 found = [height_at(time_s - at_s, heights) for time_s in passed]
         finally:
-            await self.end()
+            self.end()
         return found
 
-    async def end(self) -> None:
-        """End the readings."""
+    def end(self) -> None:
+        """End the readings, unless they have ended; on the control loop."""
         asking, self._asking = self._asking, None
         if asking is not None:
             asking.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await asking
-        await self._stack.aclose()
+            self._probe.sensor.end(self._probe.node)
 
     def _times(self, readings: Sequence[CoilReading]) -> Numbers:
         """Return the print times of the middles of the conversions."""
