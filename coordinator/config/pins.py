@@ -29,6 +29,8 @@ class PinName:
     invert: bool = False
     pull: int = 0
     """1 pull-up, -1 pull-down, 0 none."""
+    sensor: str = ""
+    """The section of the sensor that is meant: the name is no pin's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,8 @@ class PinDescription:
     purpose: str
     """Which option it is for: "'step_pin' of [stepper_x]"."""
     place: Place
+    sensor: str = ""
+    """The section of the sensor that is meant: the name is no pin's."""
 
     def number(self, pins: Mapping[str, int]) -> int:
         """Return the pin's number in the node's dictionary; raises ConfigError when it has no such pin."""
@@ -162,7 +166,7 @@ class PinRegistry:
         """Take a pin for an option; raises ConfigError for an unknown node or a pin in use."""
         place = section.options[option.name].place if option.name in section.options else section.place
         purpose = f"'{option.name}' of [{section.name}]"
-        claimed = PinDescription(pin.node, pin.name, pin.invert, pin.pull, purpose, place)
+        claimed = PinDescription(pin.node, pin.name, pin.invert, pin.pull, purpose, place, pin.sensor)
         if pin is NO_PIN:
             return claimed
         try:

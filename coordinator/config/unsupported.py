@@ -13,7 +13,7 @@ UNSUPPORTED_SECTIONS = frozenset(
     (
         *_words("manual_stepper"),
         *_words("homing_heaters temperature_probe adc_scaled ads1x1x ads1118"),
-        *_words("probe_eddy_current load_cell"),
+        *_words("load_cell"),
         *_words("load_cell_probe"),
         *_words("dockable_probe z_calibration tools_calibrate"),
         *_words("bed_tilt z_tilt_ng"),

@@ -57,6 +57,14 @@ CHIP: Final = re.compile(
 COMPILED_FOR: Final = re.compile(
     r"compiled\s+(?:#\s*)?for\s+(?:#\s*)?(?:the|an?)?\s*(.{0,60})", re.IGNORECASE
 )
+I2C_BUSES: Final = (
+    *("i2c1", "i2c2", "i2c2a", "i2c3", "i2c3a", "twi", "i2c.0"),
+    *(f"i2c{block}{letter}" for block in "01" for letter in "abcdefgh"),
+    *("i2c1_PA9_PA10", "i2c1_PB6_PB7", "i2c1_PB8_PB7", "i2c1_PB8_PB9", "i2c1_PF1_PF0", "i2c2_PA7_PA6"),
+    *("i2c2_PB10_PB11", "i2c2_PB13_PB14", "i2c2_PF1_PF0", "i2c3_PA7_PA6", "i2c3_PA8_PC9", "i2c3_PB3_PB4"),
+    *("i2c3_PC0_PC1",),
+)
+"""Names of buses that a board of any family may have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +154,7 @@ def _with_pins(build: str, pins: Ranges) -> Dictionary:
         ) from None
     # Only the names matter: each port is counted from 0, for the numbers of pins are bytes.
     content["enumerations"]["pin"] = {first: [0, count] for first, count in pins.items()}
+    content["enumerations"]["i2c_bus"] = {name: number for number, name in enumerate(I2C_BUSES)}
     return Dictionary.from_json(json.dumps(content).encode())
 
 

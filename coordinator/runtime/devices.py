@@ -11,7 +11,7 @@ from coordinator.config.model import (
 )
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.tables.axle_map import StepperTables, stepper_tables
-from nodes.devices.endstop import Endstop
+from nodes.devices.endstop import Endstop, SensorEndstop
 from nodes.devices.stepper import Stepper
 from nodes.devices.trsync import Trsync
 from nodes.dictionary.dictionary import Dictionary
@@ -33,7 +33,9 @@ class MachineDevices:
         self.description = description
         self._configure_modules = configure_modules
         self.steppers: dict[str, Stepper] = {s.name: _stepper(s) for s in description.steppers}
-        self.endstops: dict[str, Endstop] = {rail.axis: _endstop(rail) for rail in description.stops}
+        self.endstops: dict[str, Endstop | SensorEndstop] = {
+            rail.axis: _endstop(rail) for rail in description.stops
+        }
         """By the name of the rail, or of the piece of one, that it stops."""
         self.trsyncs: dict[tuple[int, str], Trsync] = {
             (slot, node): Trsync(f"homing on node {node}") for slot, node in self._homing_nodes()
@@ -79,7 +81,8 @@ class MachineDevices:
         for rail in self.description.stops:
             pin = rail.homing.endstop_pin
             if pin is not None and pin.node == config.name:
-                pin.number(pins)
+                if not pin.sensor:
+                    pin.number(pins)
                 self.endstops[rail.axis].configure(config)
         for (_, node), trsync in self.trsyncs.items():
             if node == config.name:
@@ -125,9 +128,11 @@ class MachineDevices:
         )
 
 
-def _endstop(rail: RailDescription) -> Endstop:
+def _endstop(rail: RailDescription) -> Endstop | SensorEndstop:
     pin = rail.homing.endstop_pin
     assert pin is not None
+    if pin.sensor:
+        return SensorEndstop(f"axis {rail.axis}")
     return Endstop(f"axis {rail.axis}", pin=pin.name, pull=pin.pull, invert=pin.invert)
 
 

@@ -16,7 +16,7 @@ from coordinator.virtual_machine.plant_bed import BedSettings, ProbeParts, probe
 from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
 from coordinator.virtual_machine.plant_tmc import machine_drivers
 from nodes.support.errors import CanductorError
-from nodes.virtual.plant import Axis, NodePlant, Stepper, Switch, Term
+from nodes.virtual.plant import Axis, Coil, NodePlant, Stepper, Switch, Term
 
 AXES: Final = "xyz"
 START_MM: Final = 30.0
@@ -138,7 +138,10 @@ def _probe(description: MachineDescription, start: Point, settings: PlantSetting
 def _with_probe(plant: NodePlant, parts: ProbeParts) -> NodePlant:
     if parts.node != plant.node:
         return plant
-    return replace(plant, axes=(*plant.axes, *parts.axes), beds=(parts.bed,), probes=(parts.probe,))
+    axes = (*plant.axes, *parts.axes)
+    if isinstance(parts.probe, Coil):
+        return replace(plant, axes=axes, beds=(parts.bed,), coils=(parts.probe,))
+    return replace(plant, axes=axes, beds=(parts.bed,), probes=(parts.probe,))
 
 
 def _stepper(stepper: StepperDescription, settings: PlantSettings) -> Stepper:

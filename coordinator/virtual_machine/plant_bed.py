@@ -11,8 +11,10 @@ from coordinator.config.model import MachineDescription
 from coordinator.config.pins import PinOption
 from coordinator.config.sections.nodes import make_pin_registry
 from nodes.support.errors import CanductorError
-from nodes.virtual.plant import Axis, Bed, Probe, Term
+from nodes.virtual.plant import Axis, Bed, Coil, Probe, Term
 
+_BUSES: Final = ("i2c1", "i2c2")
+"""Of a virtual node."""
 _CONTROL: Final = PinOption(name="control_pin", help="", share="plant")
 
 
@@ -27,6 +29,12 @@ class BedSettings:
     """Way up from where it triggers to where it lets go."""
     z_offset_mm: float | None = None
     """How high the nozzle truly is when it triggers; None: as configured."""
+    coil_noise_hz: float = 0.0
+    """Standard deviation of a reading of an eddy current probe."""
+    coil_drift: float = 0.0
+    """How much the frequency of its coil grows per K, as a share."""
+    coil_clock: float = 1.0
+    """How fast the reference clock of its chip truly is, as a share of the configured frequency."""
     lean_x: float = 0.0
     """How much higher it triggers per mm along X, where the axis is twisted; from x0 of the bed on."""
     lean_y: float = 0.0
@@ -44,7 +52,7 @@ class ProbeParts:
     node: str
     axes: tuple[Axis, ...]
     bed: Bed
-    probe: Probe
+    probe: Probe | Coil
 
 
 def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings: BedSettings) -> ProbeParts:
@@ -58,6 +66,9 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
     if settings.supports:
         z, *tilts_ = frame_axes(description, z, settings)
         tilts = tuple(tilts_)
+    if pin.sensor:
+        coil = _coil(description, settings, (x, y, z, *tilts))
+        return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, coil)
     true_z = described.offset[2] if settings.z_offset_mm is None else settings.z_offset_mm
     probe = Probe(
         name="probe",
@@ -79,6 +90,34 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
         control_pin=_control_pin(description, described.section, pin.node),
     )
     return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, probe)
+
+
+def _coil(description: MachineDescription, settings: BedSettings, axes: Sequence[Axis]) -> Coil:
+    """Return the coil of an eddy current probe at NODE; X, Y, Z and perhaps slopes are AXES."""
+    described = description.probe
+    assert described is not None
+    given = {
+        name: option.value
+        for name, option in parse_config(description.path).sections[described.section].options.items()
+    }
+    x, y, z, *slopes = axes
+    return Coil(
+        name="probe",
+        bus=_BUSES.index(given.get("i2c_bus", _BUSES[0])),
+        address=int(given.get("i2c_address", "42")),
+        bed=settings.shape.name,
+        x=x.name,
+        y=y.name,
+        z=z.name,
+        slope_x=slopes[0].name if slopes else None,
+        slope_y=slopes[1].name if slopes else None,
+        offset_x=described.offset[0],
+        offset_y=described.offset[1],
+        intb_pin=given["intb_pin"].rpartition(":")[2].strip("!^~ ") if "intb_pin" in given else None,
+        clock=float(given.get("frequency", "12e6")) * settings.coil_clock,
+        drift=settings.coil_drift,
+        noise=settings.coil_noise_hz,
+    )
 
 
 def _control_pin(description: MachineDescription, section: str, node: str) -> str | None:

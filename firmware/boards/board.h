@@ -25,6 +25,19 @@ uint32_t board_adc_sample(struct node *node, uint32_t pin, uint16_t *value);
 int board_pwm_setup(struct node *node, uint32_t pin, uint32_t cycle_ticks, uint16_t value);
 void board_pwm_write(struct node *node, uint32_t pin, uint16_t value);
 
+// I2C buses of the board, by number. A transfer writes, then reads with a repeated start, and may take its
+// time; tasks and commands only. The setup function returns -1 for a bus or a RATE (Hz) that it cannot do.
+enum {
+    BOARD_I2C_SUCCESS,
+    BOARD_I2C_NACK,
+    BOARD_I2C_BUS_TIMEOUT,
+    BOARD_I2C_START_NACK,
+    BOARD_I2C_START_READ_NACK,
+};
+int board_i2c_setup(struct node *node, uint32_t bus, uint32_t rate);
+int board_i2c_transfer(struct node *node, uint32_t bus, uint8_t address, const uint8_t *write,
+                       size_t write_size, uint8_t *read, size_t read_size);
+
 // The CAN controller's own view of the bus (enumeration canbus_bus_state).
 enum { BOARD_CAN_ACTIVE, BOARD_CAN_WARN, BOARD_CAN_PASSIVE, BOARD_CAN_OFF };
 struct board_can_status {

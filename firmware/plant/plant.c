@@ -238,6 +238,9 @@ int plant_input(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
     for (int i = 0; i < plant->diag_count; i++)
         if (plant->diags[i].pin == (int)pin)
             return plant_diag_level(plant, &plant->diags[i], ns);
+    for (int i = 0; i < plant->coil_count; i++)
+        if (plant->coils[i].intb_pin == (int)pin)
+            return !plant_coil_ready(plant, &plant->coils[i], ns);
     int line = line_level(plant, ns, pin);
     if (line >= 0)
         return line;
@@ -277,6 +280,13 @@ static int has_same_steppers(const struct plant *plant, const struct plant_page 
     return 1;
 }
 
+// Of what was described last of all.
+static void add_coils(struct plant *plant, struct plant_page *page) {
+    plant->first_coil = (int)page->item_count;
+    for (int i = 0; i < plant->coil_count; i++)
+        add_item(page, PLANT_COIL, plant->coils[i].name);
+}
+
 static void make_page(struct plant *plant, struct plant_page *page) {
     int keep = has_same_steppers(plant, page);
     atomic_store(&page->magic, 0);
@@ -303,6 +313,7 @@ static void make_page(struct plant *plant, struct plant_page *page) {
     plant->first_tmc = (int)page->item_count;
     for (int i = 0; i < plant->tmc_count; i++)
         add_item(page, PLANT_TMC, plant->tmcs[i].name);
+    add_coils(plant, page);
     atomic_store(&page->horizon_ns, 0);
 }
 
@@ -331,6 +342,9 @@ static void note_pins(struct plant *plant) {
         plant->writes[plant->tmcs[i].tx_pin] = plant->reads[plant->tmcs[i].rx_pin] = 1;
     for (int i = 0; i < plant->diag_count; i++)
         plant->reads[plant->diags[i].pin] = 1;
+    for (int i = 0; i < plant->coil_count; i++)
+        if (plant->coils[i].intb_pin >= 0)
+            plant->reads[plant->coils[i].intb_pin] = 1;
     for (int pin = 0; pin < PLANT_PINS; pin++)
         plant->cares[pin] |= plant->writes[pin];
 }
@@ -358,6 +372,8 @@ void plant_start(struct plant *plant, struct plant_page *page, uint64_t ns) {
     for (int i = 0; i < plant->fan_count; i++)
         plant->fans[i].at_ns = ns;
     make_page(plant, page);
+    for (int i = 0; i < plant->coil_count; i++)
+        plant_coil_start(&plant->coils[i]);
     for (int i = 0; i < plant->tmc_count; i++)
         plant_tmc_start(plant, &plant->tmcs[i], ns);
     show(plant, ns);

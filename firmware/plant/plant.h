@@ -27,6 +27,8 @@ enum {
     PLANT_TMCS = 16,
     PLANT_TMC_EDGES = 96, // more than a datagram has
     PLANT_DIAGS = 16,
+    PLANT_COILS = 2,
+    PLANT_COIL_REGISTERS = 128,
     PLANT_BODIES = 12,
     PLANT_HEATERS = 12,
     PLANT_FANS = 12,
@@ -37,7 +39,8 @@ enum {
     PLANT_ZONE_STATES = 12, // bodies and sensors that heat flows between
     PLANT_ERROR = 200,
 };
-_Static_assert(PLANT_BODIES + PLANT_HEATERS + PLANT_FANS + PLANT_SENSORS + PLANT_SWITCHES + PLANT_TMCS <=
+_Static_assert(PLANT_BODIES + PLANT_HEATERS + PLANT_FANS + PLANT_SENSORS + PLANT_SWITCHES + PLANT_TMCS +
+                       PLANT_COILS <=
                    PLANT_ITEMS,
                "all items have a place in the page");
 
@@ -107,6 +110,21 @@ struct plant_switch {
     int pressed;
     double shift; // of this approach
     uint64_t switched;
+};
+
+// The coil of an eddy current probe with its LDC1612 at ADDRESS of an I2C bus (plant_coil.c). PLACE: where
+// the coil is, by the fields of a probe; the height is that of the nozzle above the bed there, plus its
+// offset_z.
+struct plant_coil {
+    char name[PLANT_NAME];
+    int bus, address, intb_pin, body, drive; // body -1: it has the surroundings' temperature
+    struct plant_switch place;
+    double clock;                          // Hz, true
+    double far, gain, reach, drift, noise; // Hz, share, mm, 1/K, Hz (standard deviation)
+    uint16_t registers[PLANT_COIL_REGISTERS];
+    int pointer;
+    uint64_t woken_ns, taken; // readings that were read or missed
+    uint32_t latched;
 };
 
 // A driver TMC2209, or without StallGuard a TMC2208, of a stepper whose axes count MICROSTEPS to a full step.
@@ -221,13 +239,15 @@ struct plant {
     // Whether its level matters, whether more than that happens when it changes, whether the plant drives it.
     uint8_t cares[PLANT_PINS], writes[PLANT_PINS], reads[PLANT_PINS];
     int peer_count, stepper_count, axis_count, switch_count, body_count, couple_count, cooling_count;
-    int heater_count, fan_count, sensor_count, zone_count, tmc_count, diag_count, bed_count;
-    int first_heater, first_fan, first_sensor, first_switch, first_tmc; // their first items in the page
+    int heater_count, fan_count, sensor_count, zone_count, tmc_count, diag_count, bed_count, coil_count;
+    int first_heater, first_fan, first_sensor, first_switch, first_tmc,
+        first_coil; // their first items in the page
     struct plant_peer peers[PLANT_PEERS];
     struct plant_stepper steppers[PLANT_STEPPERS];
     struct plant_axis axes[PLANT_AXES];
     struct plant_switch switches[PLANT_SWITCHES];
     struct plant_bed beds[PLANT_BEDS];
+    struct plant_coil coils[PLANT_COILS];
     struct plant_tmc tmcs[PLANT_TMCS];
     struct plant_diag diags[PLANT_DIAGS];
     struct plant_body bodies[PLANT_BODIES];
@@ -257,6 +277,9 @@ void plant_reset(struct plant *plant, uint64_t ns);
 // What an input reads, or a converter gives; LEVEL and VALUE when the plant has nothing there.
 int plant_input(struct plant *plant, uint64_t ns, uint32_t pin, int level);
 uint16_t plant_sample(struct plant *plant, uint64_t ns, uint32_t pin, uint16_t value);
+// A transfer on an I2C bus; returns 0, or -1: nothing answers at that address.
+int plant_i2c(struct plant *plant, uint64_t ns, uint32_t bus, uint8_t address, const uint8_t *write,
+              size_t write_size, uint8_t *read, size_t read_size);
 // Takes new faults to heart and brings the page up to date. To be called now and then.
 void plant_update(struct plant *plant, uint64_t ns);
 
@@ -271,6 +294,11 @@ int plant_switch_pressed(struct plant *plant, struct plant_switch *it, uint64_t 
 int64_t plant_term_count(struct plant *plant, struct plant_term *term, uint64_t ns);
 void plant_steps_lost(struct plant *plant, uint64_t ns, int stepper, uint64_t steps);
 double plant_probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns);
+double plant_probe_depth_at(struct plant *plant, const struct plant_switch *it,
+                            uint64_t ns); // also in the past
+// plant_coil.c
+void plant_coil_start(struct plant_coil *coil);
+int plant_coil_ready(const struct plant *plant, const struct plant_coil *coil, uint64_t ns);
 // plant_bltouch.c
 void plant_bltouch_edge(struct plant *plant, struct plant_switch *it, uint64_t ns, int level);
 int plant_bltouch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns, uint32_t fault);

@@ -119,15 +119,42 @@ static double settled_position(struct plant *plant, int axis, uint64_t ns) {
     return plant_axis_position(plant, &plant->axes[axis], ns);
 }
 
-// How far the bed has pushed a probe in.
-double plant_probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns) {
-    double x = settled_position(plant, it->x_axis, ns) + it->offset_x;
-    double y = settled_position(plant, it->y_axis, ns) + it->offset_y;
-    double z = settled_position(plant, it->axis, ns) + x * settled_position(plant, it->slope_x_axis, ns) +
-               y * settled_position(plant, it->slope_y_axis, ns);
+// The same where NS may be past: by the history of the steppers.
+static double past_position(struct plant *plant, int axis, uint64_t ns) {
+    if (axis < 0)
+        return 0;
+    struct plant_axis *at = &plant->axes[axis];
+    settle(plant, at, ns);
+    double position = at->origin;
+    for (int i = 0; i < at->term_count; i++) {
+        struct plant_reference *stepper = &at->terms[i].stepper;
+        int64_t count = stepper->peer < 0 ? plant_page_count_at(&plant->page->steppers[stepper->found], ns)
+                                          : plant_term_count(plant, &at->terms[i], ns);
+        position += at->terms[i].mm * (double)count;
+    }
+    return position;
+}
+
+typedef double (*position_function)(struct plant *plant, int axis, uint64_t ns);
+
+static double probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns,
+                          position_function position) {
+    double x = position(plant, it->x_axis, ns) + it->offset_x;
+    double y = position(plant, it->y_axis, ns) + it->offset_y;
+    double z = position(plant, it->axis, ns) + x * position(plant, it->slope_x_axis, ns) +
+               y * position(plant, it->slope_y_axis, ns);
     const struct plant_bed *bed = &plant->beds[it->bed];
     double lean = it->lean_x * (x - bed->x0) + it->lean_y * (y - bed->y0);
     return bed_height(bed, x, y) + it->offset_z + lean - z;
+}
+
+// How far the bed has pushed a probe in.
+double plant_probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns) {
+    return probe_depth(plant, it, ns, settled_position);
+}
+
+double plant_probe_depth_at(struct plant *plant, const struct plant_switch *it, uint64_t ns) {
+    return probe_depth(plant, it, ns, past_position);
 }
 
 static double switch_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns) {

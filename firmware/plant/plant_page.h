@@ -12,7 +12,7 @@
 
 enum {
     PLANT_STEPPERS = 16,
-    PLANT_ITEMS = 80,
+    PLANT_ITEMS = 96,
     PLANT_NAME = 64,      // with the zero at its end
     PLANT_HISTORY = 4096, // steps of each stepper that can be looked up; a power of two
 };
@@ -27,6 +27,7 @@ enum plant_kind {
     PLANT_SENSOR,
     PLANT_SWITCH,
     PLANT_TMC,
+    PLANT_COIL,
 };
 
 // What can be wrong with an item, by its kind.
@@ -48,6 +49,7 @@ enum plant_fault {
     PLANT_GARBLED,
     PLANT_WARM,
     PLANT_OVERHEATED,
+    // A coil: OPEN, its chip does not answer; DEAD, it makes no readings; SHORTED, it flags them as bad.
     // A switch stays as it is, of a BLTouch the pin; it closes a fifth of a millimetre late.
     PLANT_STUCK,
     PLANT_LATE,
@@ -70,7 +72,7 @@ struct plant_page_stepper {
 // value and extra are doubles, as bits: of a body °C; of a heater its duty (0..1) and the heat it gave (J);
 // of a fan its duty and the turns it made; of a sensor the °C it has and what its converter last gave; of a
 // switch whether it is pressed and how often it has switched; of a driver the time (ns) until which its DIAG
-// is high when no step follows, and its SG_RESULT.
+// is high when no step follows, and its SG_RESULT; of a coil the frequency of its last reading (Hz).
 struct plant_page_item {
     char name[PLANT_NAME];
     uint32_t kind;

@@ -175,6 +175,43 @@ static int read_probe(const struct plant_reader *reader, char *rest) {
     return plant_text_fields(reader, FIELDS(fields), rest, it);
 }
 
+static int read_coil(const struct plant_reader *reader, char *rest) {
+    static const struct plant_field fields[] = {
+        {"name", NAME, AT(plant_coil, name), 0, 0, 0},
+        {"bus", WHOLE, AT(plant_coil, bus), 0, 1, 0},
+        {"address", WHOLE, AT(plant_coil, address), 1, 127, 0},
+        {"intb", PIN, AT(plant_coil, intb_pin), 0, 0, 1},
+        {"body", BODY, AT(plant_coil, body), 0, 0, 1},
+        {"drive", WHOLE, AT(plant_coil, drive), 0, 31, 1},
+        {"clock", NUMBER, AT(plant_coil, clock), 1e6, 1e8, 1},
+        {"far", NUMBER, AT(plant_coil, far), 1e3, 1e7, 1},
+        {"gain", NUMBER, AT(plant_coil, gain), 1e-3, 1, 1},
+        {"reach", NUMBER, AT(plant_coil, reach), 0.1, 100, 1},
+        {"drift", NUMBER, AT(plant_coil, drift), -1e-2, 1e-2, 1},
+        {"noise", NUMBER, AT(plant_coil, noise), 0, 1e6, 1},
+        {"bed", BED, AT(plant_coil, place.bed), 0, 0, 0},
+        {"x", AXIS, AT(plant_coil, place.x_axis), 0, 0, 0},
+        {"y", AXIS, AT(plant_coil, place.y_axis), 0, 0, 0},
+        {"z", AXIS, AT(plant_coil, place.axis), 0, 0, 0},
+        {"slope_x", AXIS, AT(plant_coil, place.slope_x_axis), 0, 0, 1},
+        {"slope_y", AXIS, AT(plant_coil, place.slope_y_axis), 0, 0, 1},
+        {"offset_x", NUMBER, AT(plant_coil, place.offset_x), -1e3, 1e3, 1},
+        {"offset_y", NUMBER, AT(plant_coil, place.offset_y), -1e3, 1e3, 1},
+        {"offset_z", NUMBER, AT(plant_coil, place.offset_z), -1e3, 1e3, 1},
+    };
+    struct plant *plant = reader->plant;
+    if (plant->coil_count == PLANT_COILS)
+        return plant_text_fail(reader, "coil", "too many");
+    struct plant_coil *coil = &plant->coils[plant->coil_count++];
+    coil->intb_pin = coil->body = coil->place.slope_x_axis = coil->place.slope_y_axis = -1;
+    coil->drive = 15;
+    coil->clock = 12e6;
+    coil->far = 3e6;
+    coil->gain = 0.1;
+    coil->reach = 3;
+    return plant_text_fields(reader, FIELDS(fields), rest, coil);
+}
+
 static int read_tmc(const struct plant_reader *reader, char *rest) {
     static const struct plant_field fields[] = {
         {"name", NAME, AT(plant_tmc, name), 0, 0, 0},
@@ -378,7 +415,7 @@ static int read_line(const struct plant_reader *reader, char *line) {
         {"fan", read_fan},       {"couple", read_couple},   {"cooling", read_cooling},
         {"heater", read_heater}, {"sensor", read_sensor},   {"point", read_point},
         {"tmc", read_tmc},       {"diag", read_diag},       {"bed", read_bed},
-        {"probe", read_probe},
+        {"probe", read_probe},   {"coil", read_coil},
     };
     line += strspn(line, " \t\r");
     if (!*line || *line == '#')

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 from nodes.devices.device import Device
 from nodes.devices.trsync import TriggerReason
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
+from nodes.support.errors import CanductorError
 
 COMMANDS: Final = ("config_endstop", "endstop_home", "endstop_query_state")
 SAMPLE_S: Final = 15e-6
@@ -69,3 +70,46 @@ class Endstop(Device):
         answer = await node.query("endstop_query_state", "endstop_state", oid=self._oid)
         pressed = bool(answer.integer("pin_value")) != self._invert
         return EndstopState(bool(answer.integer("homing")), answer.integer("next_clock"), pressed)
+
+
+class HomingSensor(Protocol):
+    """A sensor that may stand in for an endstop."""
+
+    def begin_homing(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
+        """Trigger the stop group when it sees its threshold, from CLOCK on."""
+
+    def end_homing(self, node: Node) -> None:
+        """Stop looking."""
+
+    async def state(self, node: Node) -> EndstopState:
+        """Return its state; raises CanductorError."""
+        ...
+
+
+class SensorEndstop(Device):
+    """An endstop of NAME that is a sensor, which its module configures and sets as ``sensor``."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"the sensor of {name}")
+        self.sensor: HomingSensor | None = None
+
+    def configure(self, config: NodeConfig) -> None:
+        """Add nothing: the sensor is a device of its module."""
+
+    @property
+    def _sensor(self) -> HomingSensor:
+        if self.sensor is None:
+            raise CanductorError(f"{self.description} is not connected")
+        return self.sensor
+
+    def home(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
+        """Trigger the stop group when it sees its threshold, from CLOCK on."""
+        self._sensor.begin_homing(node, clock=clock, rest_ticks=rest_ticks, trsync_oid=trsync_oid)
+
+    def end(self, node: Node) -> None:
+        """Stop looking."""
+        self._sensor.end_homing(node)
+
+    async def state(self, node: Node) -> EndstopState:
+        """Return its state; raises CanductorError."""
+        return await self._sensor.state(node)

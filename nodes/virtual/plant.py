@@ -125,6 +125,44 @@ class Probe:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Coil:
+    """The coil of an eddy current probe with its LDC1612 at ADDRESS of I2C bus number BUS.
+
+    Its frequency, in Hz, is far·(1 + gain·e^(-h / reach))·(1 + drift·(T - 25 °C)), where h is the height of
+    the nozzle above BED at the place of the coil, OFFSET_X, OFFSET_Y from the nozzle. X, Y, Z and the slopes
+    are axes as of a probe; T is the temperature of BODY.
+    """
+
+    name: str
+    bus: int
+    address: int
+    bed: str
+    x: str
+    y: str
+    z: str
+    slope_x: str | None = None
+    slope_y: str | None = None
+    offset_x: float = 0.0
+    offset_y: float = 0.0
+    offset_z: float = 0.0
+    intb_pin: str | None = None
+    body: str | None = None
+    """None: it has ambient temperature."""
+    drive: int = 15
+    """Drive current (0 to 31) at which its amplitude is right; 3 more or less are possible."""
+    clock: float = 12e6
+    """Hz, of the chip's reference, as it truly is."""
+    far: float = 3e6
+    gain: float = 0.1
+    reach: float = 3.0
+    """mm."""
+    drift: float = 0.0
+    """1/K."""
+    noise: float = 0.0
+    """Hz, standard deviation of a reading."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Tmc:
     """The driver CHIP (tmc2208, tmc2209) of a stepper of the same node, on a UART.
 
@@ -274,6 +312,7 @@ _FIELD_NAMES: Final = {
     "enable_pin": "enable",
     "tach_pin": "tach",
     "control_pin": "control",
+    "intb_pin": "intb",
     "tx_pin": "tx",
     "rx_pin": "rx",
 }
@@ -292,6 +331,7 @@ class NodePlant:
     switches: tuple[Switch, ...] = ()
     beds: tuple[Bed, ...] = ()
     probes: tuple[Probe, ...] = ()
+    coils: tuple[Coil, ...] = ()
     tmcs: tuple[Tmc, ...] = ()
     diags: tuple[Diag, ...] = ()
     bodies: tuple[Body, ...] = ()
@@ -331,7 +371,7 @@ class NodePlant:
         for kind, parts in (
             *(("switch", self.switches), ("bed", self.beds), ("probe", self.probes), ("tmc", self.tmcs)),
             *(("diag", self.diags), ("body", self.bodies), ("couple", self.couples), ("fan", self.fans)),
-            *(("cooling", self.coolings), ("heater", self.heaters)),
+            *(("cooling", self.coolings), ("heater", self.heaters), ("coil", self.coils)),
         ):
             yield from self._parts(kind, parts)
         for sensor in self.sensors:

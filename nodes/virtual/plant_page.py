@@ -16,7 +16,7 @@ from nodes.support.errors import CanductorError
 
 _MAGIC: Final = 0x31544E4C50444E43
 _NAME: Final = 64
-_ITEMS: Final = 80
+_ITEMS: Final = 96
 _STEPPERS: Final = 16
 _HISTORY: Final = 4096
 _HEADER: Final = np.dtype(
@@ -47,6 +47,8 @@ class PlantItemKind(IntEnum):
     SWITCH = 5
     TMC = 6
     """A stepper's driver."""
+    COIL = 7
+    """The coil of an eddy current probe, with its chip."""
 
 
 class PlantFault(IntEnum):
@@ -93,6 +95,7 @@ _FAULTS: Final[Mapping[PlantItemKind, tuple[PlantFault, ...]]] = {
         PlantFault.WARM,
         PlantFault.OVERHEATED,
     ),
+    PlantItemKind.COIL: (PlantFault.OPEN, PlantFault.DEAD, PlantFault.SHORTED),
 }
 
 
@@ -115,7 +118,7 @@ class Item:
     fault: PlantFault
     value: float
     """Body: °C; heater, fan: duty, 0 to 1; sensor: its own °C; switch: 1: pressed; driver: true time (ns)
-    until which its DIAG is high if no step follows."""
+    until which its DIAG is high if no step follows; coil: Hz of its last reading."""
     extra: float
     """Heater: J delivered so far; fan: revolutions; sensor: last sample; switch: number of changes; driver:
     SG_RESULT."""

@@ -223,8 +223,10 @@ def test_accuracy_reports_the_spread_of_its_measurements(tmp_path: Path) -> None
     output = measured(tmp_path, "PROBE_ACCURACY SAMPLES=6", noise_mm=0.03)
     found = heights(output)
     assert len(found) == 6
-    assert f"range {np.ptp(found):.6f}" in output[-1]
-    assert f"standard deviation {np.std(found):.6f}" in output[-1]
+    figures = dict(part.rsplit(" ", 1) for part in output[-1].partition(": ")[2].split(", "))
+    # Of heights that were rounded to a millionth of a millimetre.
+    assert float(figures["range"]) == pytest.approx(np.ptp(found), abs=1.5e-6)
+    assert float(figures["standard deviation"]) == pytest.approx(np.std(found), abs=1.5e-6)
     assert output[0].startswith("PROBE_ACCURACY at X:0.000 Y:0.000 Z:6.000 (samples=6")
     assert len(heights(measured(tmp_path, "PROBE_ACCURACY"))) == 10
 

@@ -33,7 +33,13 @@ PROBE: Mapping[str, object] = {
     "speed": 5,
 }
 KINDS: Mapping[str, Mapping[str, object]] = {
-    "bltouch": {"pin": None, "sensor_pin": "^toolhead:PC5", "control_pin": "toolhead:PB0"}
+    "probe_eddy_current coil": {
+        **dict.fromkeys(("pin", "z_offset")),
+        "sensor_type": "ldc1612",
+        "i2c_mcu": "toolhead",
+        "reg_drive_current": 15,
+    },
+    "bltouch": {"pin": None, "sensor_pin": "^toolhead:PC5", "control_pin": "toolhead:PB0"},
 }
 """What other kinds of probes have in their sections."""
 

@@ -11,8 +11,8 @@ from typing import Final, TypeVar
 from coordinator.config.errors import ConfigError, NotSupported
 from coordinator.config.file import ConfigFile, RawSection
 from coordinator.config.model import PROBE_ENDSTOP, HomingDescription, ProbeDescription
-from coordinator.config.options import BadValue, FloatOption, Option
-from coordinator.config.pins import PinOption, PinRegistry, ProbeSwitch
+from coordinator.config.options import BadValue, FloatOption, Option, TextOption
+from coordinator.config.pins import PRIMARY_NODE, PinName, PinOption, PinRegistry, ProbeSwitch
 from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.sections.reading import Reading
@@ -43,6 +43,18 @@ Z_OFFSET: Final = FloatOption(
     minimum=-MAX_POSITION,
     maximum=MAX_POSITION,
 )
+EDDY: Final = "probe_eddy_current"
+"""First word of the sections of probes that are a sensor on an I2C bus, not a switch."""
+I2C_MCU: Final = TextOption(name="i2c_mcu", help="node of the I2C bus", default=PRIMARY_NODE)
+DESCEND_Z: Final = FloatOption(
+    name="descend_z",
+    help="height of the nozzle at which a way down ends; it is measured there",
+    default=0.5,
+    unit="mm",
+    above=0,
+    maximum=10,
+)
+_SENSOR: Final = PinOption(name=I2C_MCU.name, help="", share="endstop")
 T = TypeVar("T")
 
 
@@ -52,14 +64,26 @@ def note_probe(config: ConfigFile, pins: PinRegistry) -> None:
     Raises ConfigError where there are two.
     """
     section = _section(config)
+    if section is not None and section.kind == EDDY:
+        _note_sensor(section, pins)
+        return
     pin = None if section is None else _value(section, INPUTS[section.name])
     if section is not None and pin is not None:
         x, y, z = (_value(section, option) or 0.0 for option in (*OFFSETS, Z_OFFSET))
         pins.probe = ProbeSwitch(pin, (x, y, z), section.name)
 
 
+def _note_sensor(section: RawSection, pins: PinRegistry) -> None:
+    node = _value(section, I2C_MCU) or PRIMARY_NODE
+    x, y = (_value(section, option) or 0.0 for option in OFFSETS)
+    z = _value(section, DESCEND_Z) or _value(section, Z_OFFSET) or DESCEND_Z.default
+    assert z is not None
+    pin = PinName(node if node in pins.nodes else PRIMARY_NODE, section.name, sensor=section.name)
+    pins.probe = ProbeSwitch(pin, (x, y, z), section.name)
+
+
 def _section(config: ConfigFile) -> RawSection | None:
-    found = [section for name, section in config.sections.items() if name in INPUTS]
+    found = [section for name, section in config.sections.items() if name in INPUTS or section.kind == EDDY]
     if len(found) > 1:
         raise ConfigError(
             found[1].place,
@@ -86,7 +110,7 @@ def read_probe(reading: Reading, frame: Frame) -> ProbeDescription | None:
     if found is None or section is None or not frame.rails:
         return None
     try:
-        pin = reading.pins.claim(found.pin, INPUTS[section.name], section)
+        pin = reading.pins.claim(found.pin, INPUTS.get(section.name, _SENSOR), section)
     except NotSupported:
         return None  # its module is left out for the same reason
     if rail_z is not None and rail_z.homing.virtual_endstop == PROBE_ENDSTOP:

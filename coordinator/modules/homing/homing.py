@@ -210,9 +210,26 @@ class Homing(Module):
             most_mm = self._most_again_mm(rail)
             results = await self._move(approach, most_mm, homing.second_speed)
         beyond_mm = [result.beyond_trigger_mm for result in results]
+        if self._probe is not None and homing.by_probe:
+            beyond_mm = await self._measured(approach, beyond_mm)
         if rail.axis in AXES:
             await self._align(approach, beyond_mm)
         return beyond_mm
+
+    async def _measured(self, approach: Approach, beyond_mm: list[float]) -> list[float]:
+        """Return BEYOND_MM, or what follows from the height that the probe measures at standstill."""
+        assert self._probe is not None
+        try:
+            height_mm = await self._probe.standing_mm()
+        except CanductorError as error:
+            if self._machine.stopped is not None:
+                raise
+            raise HomingError(
+                f"Z was not homed: {error}; the head was lowered to about"
+                f" {approach.rails[0].homing.position_endstop:g} mm above the bed"
+            ) from error
+        trigger_mm = approach.rails[0].homing.position_endstop
+        return beyond_mm if height_mm is None or trigger_mm is None else [trigger_mm - height_mm]
 
     @staticmethod
     def _most_again_mm(rail: RailDescription) -> float:

@@ -33,6 +33,13 @@ class ProbeEndstop(Module):
         """Acceleration of the way down at most, mm/s²; None: any."""
         return None
 
+    async def standing_mm(self) -> float | None:
+        """Measure how high the nozzle is above the bed where the head stands; None: it feels a trigger only.
+
+        Raises CanductorError.
+        """
+        return None
+
     @property
     def has_lines(self) -> bool:
         """Whether lines of g-code are run before or after a move towards it."""

@@ -1,7 +1,8 @@
 """Places that are probed one after the other: the options that name them, and the ways between them."""
 
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 from coordinator.config.errors import NotSupported
@@ -104,7 +105,7 @@ def how_to_measure(call: Call, probe: Probe | None) -> Measuring | None:
         raise WordError(f"METHOD of {command.name} is {quoted(written)}; automatic and manual are possible")
     if probe is None:
         raise WordError(f"METHOD of {command.name} is {method}, and there is no probe; give METHOD=manual")
-    return probe.how(command)
+    return replace(probe.how(command), method=method)
 
 
 class ProbePoints:
@@ -149,6 +150,16 @@ class ProbePoints:
     ) -> Generator[Reading, None, list[Measured] | None]:
         """Measure all places (or PLACES) in turn; None: it is only planned. It ends at travel HEIGHT."""
         height = self.height(command) if height is None else height
+        if probe.scans and how.method != AUTOMATIC[0]:
+            travels = [
+                partial(self.travel, job, probe, place, height, how.lift_speed)
+                for place in (self.places if places is None else places)
+            ]
+            yield from probe.deploy(job, command)
+            scanned = yield from probe.scan(job, command, how, travels)
+            if scanned is not None:
+                yield from probe.stow(job, command)
+            return scanned
         found = []
         yield from probe.deploy(job, command)
         for place in self.places if places is None else places:

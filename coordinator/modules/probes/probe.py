@@ -5,7 +5,7 @@ the probe triggers, the lines of ``deactivate_gcode``, a lift, and that again un
 Modules that level something ask for places by ``deploy``, ``measure`` and ``stow``.
 """
 
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final
 
@@ -112,6 +112,8 @@ class Measuring:
     lift_speed: float
     retract_mm: float
     rules: SampleRules
+    method: str = "automatic"
+    """Or ``scan``, ``rapid_scan``: for a probe that ``scans``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,16 +154,17 @@ class Probe(ProbeEndstop):
     """
 
     SHOWN_AS = "probe"
-    INPUT: ClassVar[PinOption] = PIN
-    """Its input."""
+    INPUT: ClassVar[PinOption | None] = PIN
+    """Its input; None: it has none."""
     HAS_LINES: ClassVar[bool] = True
     """Whether it has the options of LINE_OPTIONS."""
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        build.pin(self.INPUT)
+        if self.INPUT is not None:
+            build.pin(self.INPUT)
         x, y = (build.get(option) for option in OFFSETS)
-        self.offset: Point = (x, y, build.get(Z_OFFSET))
+        self.offset: Point = (x, y, self.trigger_height(build))
         """From the nozzle: X, Y, and how high that is when the probe triggers, mm."""
         speed = build.get(SPEED)
         self.measuring = Measuring(
@@ -192,6 +195,10 @@ class Probe(ProbeEndstop):
         self._skews: Skews | None = None
         self.last_query = False
         self._last: Measured | None = None
+
+    def trigger_height(self, build: Build) -> float:
+        """Return how high the nozzle is when it triggers, mm; raises ConfigError."""
+        return build.get(Z_OFFSET)
 
     def link(self, modules: Modules) -> None:
         """Find what makes X and Y of programs others than those of the motors."""
@@ -263,6 +270,9 @@ class Probe(ProbeEndstop):
         if "Z" not in call.homed:
             raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
 
+    def check_offset(self, command: Command) -> None:
+        """Raise WordError where COMMAND, which finds a z_offset, does not apply to this kind of probe."""
+
     async def is_triggered(self) -> bool:
         """Return whether its node sees it triggered now; raises CanductorError."""
         machine = self.live.machine
@@ -316,6 +326,21 @@ class Probe(ProbeEndstop):
             raise WordError(f"{command.name} failed: {series.failed}")
         return self._found(contact, series.result)
 
+    @property
+    def scans(self) -> bool:
+        """Whether it measures at travel height, by ``scan``."""
+        return False
+
+    def scan(
+        self,
+        job: ProgramContext,
+        command: Command,
+        how: Measuring,
+        travels: Sequence[Callable[[], Iterator[Reading]]],
+    ) -> Generator[Reading, None, list[Measured] | None]:
+        """Measure where each of TRAVELS leads, at travel height; None: it is only planned."""
+        raise NotImplementedError
+
     def touch(
         self, job: ProgramContext, command: Command, how: Measuring
     ) -> Generator[Reading, None, Contact | None]:
@@ -339,6 +364,7 @@ class Probe(ProbeEndstop):
             try:
                 async with self.touching(alone=False):
                     contact = await move.run()
+                    contact = await self._measured(contact)
             except NotReadyError as error:
                 raise CanductorError(f"{command.name} failed: {error}; {await self._place()}") from error
             except CanductorError as error:
@@ -354,6 +380,13 @@ class Probe(ProbeEndstop):
         if self._each:
             yield from self._run_lines(job, command, self._deactivate)
         return found[0]
+
+    async def _measured(self, contact: Contact) -> Contact:
+        """Return CONTACT, for a probe that measures at standstill with the height that it found."""
+        height_mm = await self.standing_mm()
+        if height_mm is None:
+            return contact
+        return replace(contact, trigger_z=contact.position[2] - height_mm + self.offset[2])
 
     async def _place(self) -> str:
         place = await place_by_steps(self.live.machine)

@@ -127,6 +127,7 @@ class ProbeCommands(Module):
     # ----------------------------------------------------------------------------------------- calibrating
 
     def _read_calibrate(self, call: Call) -> Reading:
+        self.probe.check_offset(call.command)
         how = self.probe.how(call.command)
         speed = bounded(
             call.command,
@@ -157,6 +158,7 @@ class ProbeCommands(Module):
 
     def _read_apply(self, call: Call) -> Reading:
         call.parameters()
+        self.probe.check_offset(call.command)
         offset = call.figures()["gcode_move"]["homing_origin"].z  # type: ignore[attr-defined]
 
         async def apply() -> Done:

@@ -21,7 +21,8 @@ from coordinator.config.model import CanConnection, RailDescription, StepperDesc
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.single import START_LEAD_S, WAY, Ramp, SingleMove, ratio_of
 from nodes.clock.clock import Ticks, extend32
-from nodes.devices.endstop import Endstop
+from nodes.devices.endstop import Endstop, SensorEndstop
+from nodes.devices.ldc1612 import ERRORS as SENSOR_ERRORS
 from nodes.devices.trsync import NO_GROUP, TriggerReason, Trsync, TrsyncState
 from nodes.node.node import Node
 from nodes.support.errors import CanductorError
@@ -119,7 +120,7 @@ class _Leg:
 
     rail: RailDescription
     slot: int
-    endstop: Endstop
+    endstop: Endstop | SensorEndstop
     endstop_node: Node
     steppers: Sequence[StepperDescription]
     syncs: Sequence[tuple[Node, Trsync]]
@@ -359,6 +360,9 @@ class HomingMove:
                     f"node {node.name} did not hear from the host for {leg.timeout_s:g} s and stopped by"
                     " itself; check the bus for errors and load",
                 )
+        error = states[leg.endstop_node.name].reason.sensor_error
+        if error is not None:
+            raise MoveEndedError(leg.name, SENSOR_ERRORS[error])
         if not _switched(leg, states):
             raise EndstopNotFoundError(
                 f"axis {leg.name} moved {self._ramp.way_mm:g} mm and its endstop did not switch; "

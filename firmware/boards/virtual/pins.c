@@ -126,6 +126,26 @@ void board_pwm_write(struct node *node, uint32_t pin, uint16_t value) {
     set_pwm(board_of(node), pin, value);
 }
 
+// What is on the buses only the plant knows; a transfer takes no time.
+enum { I2C_BUSES = 2 };
+DECL_ENUMERATION("i2c_bus", "i2c1", 0);
+DECL_ENUMERATION("i2c_bus", "i2c2", 1);
+
+int board_i2c_setup(struct node *node, uint32_t bus, uint32_t rate) {
+    (void)node;
+    return bus < I2C_BUSES && rate ? 0 : -1;
+}
+
+int board_i2c_transfer(struct node *node, uint32_t bus, uint8_t address, const uint8_t *write,
+                       size_t write_size, uint8_t *read, size_t read_size) {
+    struct virtual_board *board = board_of(node);
+    if (!board->plant)
+        return BOARD_I2C_START_NACK;
+    int status =
+        plant_i2c(board->plant, virtual_true_ns(board), bus, address, write, write_size, read, read_size);
+    return status ? BOARD_I2C_START_NACK : BOARD_I2C_SUCCESS;
+}
+
 // Everything runs in one thread: nothing to mask.
 // Nothing interrupts here; what matters on a chip is checked: every section that is masked ends.
 static _Noreturn void irq_fault(void) {

@@ -13,6 +13,7 @@ from coordinator.planning.plan import plan_file
 from coordinator.planning.report import PlanReport
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
+from nodes.node.config import NodeConfigError
 from nodes.virtual.firmware import MAINBOARD, firmware_path
 
 MACHINE = (Path(__file__).parents[3] / "config" / "cartesian_uart.cfg").read_text(encoding="utf-8")
@@ -60,6 +61,13 @@ def test_without_a_dictionary_only_the_form_of_a_pin_is_checked_and_a_notice_say
 def test_what_is_no_pin_of_any_chip_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="node 'mcu' has no pin 'PX1'"):
         planned(tmp_path, with_step_pin("PX1"))
+
+
+def test_an_i2c_bus_is_one_that_some_board_has(tmp_path: Path) -> None:
+    eddy = "\n[probe_eddy_current coil]\nsensor_type: ldc1612\ni2c_bus: {}\n"
+    planned(tmp_path, MACHINE + eddy.format("i2c1_PB6_PB7"))
+    with pytest.raises(NodeConfigError, match=r"has no I2C bus 'i2c9'; it has i2c1, .*: correct i2c_bus"):
+        planned(tmp_path, MACHINE + eddy.format("i2c9"))
 
 
 def test_a_chip_named_in_a_comment_has_its_own_pins(tmp_path: Path) -> None:
