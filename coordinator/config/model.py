@@ -376,4 +376,6 @@ class MachineDescription:
         followed = {extruder.stepper.name: extruder.name for extruder in self.extruders}
         followed |= {follower.stepper.name: follower.extruder for follower in self.extruder_steppers}
         names = tuple(extruder.name for extruder in self.extruders)
-        return ExtruderMotion(names, names[0] if names else "", followed)
+        steppers = (*self.extruders, *self.extruder_steppers)
+        turns = {each.stepper.name: each.stepper.rotation_distance for each in steppers}
+        return ExtruderMotion(names, names[0] if names else "", followed, turns)

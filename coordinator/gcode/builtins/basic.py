@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 
 from coordinator.gcode.builtins import machine as machine_commands
 from coordinator.gcode.builtins import state as state_commands
+from coordinator.gcode.builtins import tuning as tuning_commands
 from coordinator.gcode.commands import AtStandstill, ProgramContext
 from coordinator.gcode.events import Done, Emergency, Reply, Wait
 from coordinator.gcode.parameters import bounded, numbers
@@ -96,8 +97,6 @@ def _set_accel(job: ProgramContext, command: Command) -> bool:
     _positive(command, words)
     if "S" in words:
         words = {"S": words["S"]}
-    elif len(words) == 1:
-        return True  # P or T alone has no effect, as users of such programs know it
     for accel in words.values():
         _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
     job.planner.set_accel_words(words)
@@ -245,7 +244,7 @@ _motors_off = _without_module("motor-off commands")
 WHILE_PRINTING = frozenset(
     (
         *("M73", "M105", "M112", "M114", "M117", "M118", "M204", "M220", "M221"),
-        *("GET_POSITION", "SET_GCODE_OFFSET", "SET_PRESSURE_ADVANCE", "SET_VELOCITY_LIMIT"),
+        *("GET_POSITION", "SET_GCODE_OFFSET", "SET_PRESSURE_ADVANCE", "SET_VELOCITY_LIMIT", "TUNING_TOWER"),
     )
 )
 """Commands that neither move nor wait: a client may give them while a job prints."""
@@ -281,4 +280,5 @@ HANDLERS: Mapping[str, Handler] = {
     "SET_VELOCITY_LIMIT": _set_velocity_limit,
     **machine_commands.HANDLERS,
     **state_commands.HANDLERS,
+    **tuning_commands.HANDLERS,
 }

@@ -347,15 +347,24 @@ class Planner:
 
     @property
     def accel(self) -> float:
-        """mm/s² (M204)."""
+        """mm/s² of moves with filament (M204); setting it sets ``travel_accel``, too."""
         return float(self._core.accel)
 
     @accel.setter
     def accel(self, accel: float) -> None:
         self.set_accel_words({"S": accel})
 
+    @property
+    def travel_accel(self) -> float:
+        """mm/s² of moves without filament (M204 T)."""
+        return float(self._core.travel_accel)
+
+    @travel_accel.setter
+    def travel_accel(self, accel: float) -> None:
+        self.set_accel_words({"T": accel})
+
     def set_accel_words(self, words: Mapping[str, float]) -> None:
-        """M204: S, or the lower of P (print) and T (travel); one of these alone has no effect."""
+        """M204: S of all moves, P of those with filament, T of others; the lower of P and T of all."""
         most = self.limits.max_accel
         capped = {key: min(check_number("the acceleration", a, 1e-3), most) for key, a in words.items()}
         if lib.gcode_accel(self._core, gcode_words(capped)):
@@ -527,6 +536,18 @@ class Planner:
     def forget_line(self) -> None:
         """Forget what is left of a line: another program begins."""
         self._state.lines = self._state.arc.pieces = self._state.arc.done = 0
+
+    # ---- The height of what is printed ----
+
+    def watch_height(self, z_mm: float | None) -> None:
+        """Let ``feed`` stop before a move that prints at another height than Z_MM; None: no longer."""
+        self._state.tower = lib.GCODE_NO_TOWER if z_mm is None else lib.GCODE_TOWER
+        self._state.tower_z = 0.0 if z_mm is None else z_mm
+
+    @property
+    def new_height_mm(self) -> float | None:
+        """The height for which ``feed`` has stopped, in the machine's frame; None: it did not."""
+        return float(self._state.tower_next_z) if self._state.tower == lib.GCODE_TOWER_DUE else None
 
     # ---- What is left out ----
 

@@ -89,7 +89,8 @@ def describe_dual(
     given = reader.find(SAFE_DISTANCE)
     usual = min(abs(ranges[0][0] - ranges[1][0]), abs(ranges[0][1] - ranges[1][1]))
     one, two = (_carriage(rail, steppers) for rail, steppers in (first, second))
-    dual = DualCarriage(axis, (one, two), usual if given is None else given)
+    speed_mm_s = first[0].homing.speed
+    dual = DualCarriage(axis, (one, two), usual if given is None else given, speed_mm_s)
     if abs(one.home - two.home) < dual.safe_distance:
         raise reader.bad(
             SAFE_DISTANCE,
