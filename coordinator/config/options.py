@@ -169,19 +169,20 @@ class BoolOption(Option[bool]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChoiceOption(Option[str]):
-    """One word of several."""
+    """One word of several, in capitals or not."""
 
     choices: tuple[str, ...]
     unsupported: tuple[str, ...] = ()
     """Words known from other hosts that are not supported yet."""
 
     def parse(self, text: str) -> str:
-        """Return the word."""
-        if text in self.unsupported:
+        """Return the word as it stands among the choices."""
+        if text.lower() in (word.lower() for word in self.unsupported):
             raise NotBuilt
-        if text not in self.choices:
-            raise BadValue
-        return text
+        for word in self.choices:
+            if word.lower() == text.lower():
+                return word
+        raise BadValue
 
     def rule(self) -> str:
         """Return the values allowed."""

@@ -20,7 +20,6 @@ from typing import Final
 
 from coordinator.kinematics.base import Weights
 
-
 _ROUNDING_MM: Final = 1e-6
 
 
@@ -149,8 +148,8 @@ class DualCarriage:
             if self._stay_apart(here, targets, order):
                 return tuple(order)
         raise ValueError(
-            f"the carriages cannot go back to {targets[0]:.6g} and {targets[1]:.6g} mm one after the other and"
-            " stay apart; move them there by G1"
+            f"the carriages cannot go back to {targets[0]:.6g} and {targets[1]:.6g} mm one after the other"
+            " and stay apart; move them there by G1"
         )
 
     def _stay_apart(

@@ -116,8 +116,7 @@ def _limit_axes(what: str) -> Handler:
 
 def _set_jerk(job: ProgramContext, command: Command) -> bool:
     """M205: the lesser of X and Y is the speed at a right-angled corner; the rest means nothing here."""
-    words = numbers(command, "XYZEBSTJ")
-    corner = [words[letter] for letter in "XY" if letter in words]
+    corner = list(numbers(command, "XY").values())
     if corner:
         _positive(command, {"X or Y": min(corner)})
         job.planner.square_corner_velocity = min(*corner, job.planner.limits.square_corner_velocity)

@@ -60,6 +60,7 @@ EXTRUDER_LIMITS: Final = (
     "max_extrude_ratio",
     "instantaneous_corner_velocity",
 )
+AXIS_LIMITS: Final = tuple(f"max_{axis}_{what}" for axis in "xyz" for what in ("velocity", "accel"))
 DEFAULT_SPEED_MM_S = 25.0
 """Speed of moves before the first F word."""
 RING_TRAPEZOIDS = int(lib.PLANNER_RING)
@@ -97,6 +98,8 @@ class Planner:
         self._count: Any = ffi.new("uint32_t *")
         self.limits = limits
         """What was configured; ``accel`` and the like never exceed it."""
+        self._extruder_limits = limits
+        """What was configured for the active extruder."""
         self._offset_mm = [0.0, 0.0, 0.0, 0.0]
         self.set_arc_precision()
 
@@ -329,7 +332,7 @@ class Planner:
     # ---- Modes ----
 
     def reset_modes(self) -> None:
-        """Take units, modes, speed and dynamics back to where a program begins.
+        """Take units, modes, speed, dynamics and limits of axes back to where a program begins.
 
         Positions, the G-code origin, what is homed and the factors (M220, M221) stay.
         """
@@ -342,6 +345,12 @@ class Planner:
         self.max_velocity = self.limits.max_velocity
         self.square_corner_velocity = self.limits.square_corner_velocity
         self.minimum_cruise_ratio = self.limits.minimum_cruise_ratio
+        self._take_limits(self.limits, AXIS_LIMITS)
+        self._take_limits(self._extruder_limits, EXTRUDER_LIMITS)
+
+    def _take_limits(self, limits: MotionLimits, names: Iterable[str]) -> None:
+        for name in names:
+            setattr(self._core.limits, name, getattr(limits, name))
 
     # ---- Speeds, accelerations and ranges; speeds in mm/s ----
 
@@ -437,8 +446,8 @@ class Planner:
     def set_extruder_limits(self, limits: MotionLimits) -> None:
         """Take over what LIMITS say of filament: another extruder is active."""
         check_limits(limits)
-        for name in EXTRUDER_LIMITS:
-            setattr(self._core.limits, name, getattr(limits, name))
+        self._extruder_limits = limits
+        self._take_limits(limits, EXTRUDER_LIMITS)
 
     # ---- Offsets ----
 

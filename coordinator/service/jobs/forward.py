@@ -21,7 +21,14 @@ from coordinator.runtime.machine import Modules
 from coordinator.streaming.program_machine import machine_state
 from nodes.support.errors import CanductorError
 
-_DYNAMICS: Final = ("accel", "travel_accel", "max_velocity", "square_corner_velocity", "minimum_cruise_ratio", "plane")
+_DYNAMICS: Final = (
+    "accel",
+    "travel_accel",
+    "max_velocity",
+    "square_corner_velocity",
+    "minimum_cruise_ratio",
+    "plane",
+)
 
 
 @dataclass(frozen=True)

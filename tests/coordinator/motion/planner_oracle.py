@@ -68,7 +68,7 @@ class Language:
             self.relative_e = code == "M83"
         elif code == "M204":
             accel = min(float(rest[1:]), self.limits.max_accel)
-            self.accel |= {kind: accel for kind in ("PT" if rest[0] == "S" else rest[0])}
+            self.accel |= dict.fromkeys("PT" if rest[0] == "S" else rest[0], accel)
 
     def move(self, words: dict[str, float]) -> None:
         target = list(self.at)

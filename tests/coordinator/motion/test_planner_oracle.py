@@ -58,7 +58,9 @@ def programs(draw: st.DrawFn) -> list[str]:
         if kind == "e":
             lines.append(f"G1 E{draw(st.sampled_from([-2, -0.6, 0.6, 2]))}")
         elif kind == "accel":
-            lines.append(f"M204 {draw(st.sampled_from('SPT'))}{draw(st.sampled_from([500, 2000, 5000, 10000]))}")
+            lines.append(
+                f"M204 {draw(st.sampled_from('SPT'))}{draw(st.sampled_from([500, 2000, 5000, 10000]))}"
+            )
         elif kind == "speed":
             lines.append(f"G1 F{draw(st.sampled_from([60, 600, 4800, 12000, 18000]))}")
         else:

@@ -69,6 +69,11 @@ class SumOption(Option[Sum]):
             terms[name] = value
         return tuple(terms.items())
 
+    def setting(self, text: str, value: Sum) -> object:
+        """Return the text."""
+        del value
+        return text
+
     def rule(self) -> str:
         """Return the values allowed."""
         return "a sum of different carriages as in carriage_x, x-y or carriage_x+0.5*carriage_y"
