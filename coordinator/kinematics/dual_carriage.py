@@ -46,6 +46,8 @@ class Carriage:
     """Where it is after homing."""
     steppers: tuple[tuple[str, Weights], ...]
     """Names, and weights when this carriage is the primary."""
+    name: str = ""
+    """As status reports call it."""
 
 
 @dataclass(frozen=True, slots=True)

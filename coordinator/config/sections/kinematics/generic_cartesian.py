@@ -253,7 +253,11 @@ def _frame(
             raise ConfigError(
                 rail.place, f"no [stepper NAME] moves carriage '{name}'; name it in 'carriages' of one"
             )
-        dual = describe_dual(reader, axis, (frame.rails[axis], frame.rails[axis].steppers), (rail, theirs))
+        first = next(each for each, other in carriages.first.items() if other.axis == rail.axis)
+        names = (first, name)
+        dual = describe_dual(
+            reader, axis, (frame.rails[axis], frame.rails[axis].steppers), (rail, theirs), names
+        )
         reading.finish(reader, waiting=WAITING if rail.homing.waits else ())
         frame = park(frame, dual, theirs, reader.name)
     return frame
