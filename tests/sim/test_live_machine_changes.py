@@ -56,3 +56,44 @@ def test_a_tower_another_way_per_turn_and_carriages_that_go_back() -> None:
     assert demo.true_mm("x") == pytest.approx(83.107, abs=0.0125)
     assert demo.true_mm("dual_carriage") == pytest.approx(223.107, abs=0.0125)
     assert demo.true_mm("y") == pytest.approx(31.7, abs=0.0125)
+
+
+SWAPPED = """\
+G28
+G90
+M83
+G1 X50 Y60 Z10 F9000
+SET_STEPPER_CARRIAGES STEPPER=screw CARRIAGES=2*z
+G1 Z12
+SET_STEPPER_CARRIAGES STEPPER=belt_a CARRIAGES=x-y DISABLE_CHECKS=1
+SET_STEPPER_CARRIAGES STEPPER=belt_b CARRIAGES=x+y DISABLE_CHECKS=1
+SET_STEPPER_CARRIAGES STEPPER=belt_a1 CARRIAGES=x-y DISABLE_CHECKS=1
+SET_STEPPER_CARRIAGES STEPPER=belt_b1 CARRIAGES=y+x
+G1 X70.03 Y50.01
+"""
+
+
+def test_motors_that_follow_other_carriages_from_a_line_on() -> None:
+    demo = SimulatedDemo(EXAMPLES / "generic_cartesian.cfg")
+    report = demo.prove(SWAPPED)
+    assert all(stepper.holds for stepper in report.steppers), report.to_text()
+    # Both belts have changed places: what was Y goes the other way; and Z goes twice as far.
+    for axis, place in {"x": 70.03, "y": 60 + (60 - 50.01), "z": 10 + 2 * 2}.items():
+        assert demo.true_mm(axis) == pytest.approx(place, abs=0.0125), axis
+
+
+def test_homing_and_positions_are_those_of_the_motors_as_they_are() -> None:
+    demo = SimulatedDemo(EXAMPLES / "generic_cartesian.cfg")
+    said: list[str] = []
+    demo.print_lines(
+        [
+            "SET_STEPPER_CARRIAGES STEPPER=screw CARRIAGES=0.5*z",
+            "G28",
+            "G1 X20 Y20 Z8 F3000",
+            "GET_POSITION",
+        ],
+        on_output=lambda output: said.append(output.text),
+    )
+    assert demo.true_mm("z") == pytest.approx(4, abs=0.0125), "half a way per way of the axis"
+    kinematic = next(line for line in said if line.startswith("kinematic:"))
+    assert float(kinematic.rpartition("Z:")[2]) == pytest.approx(8, abs=0.0125)

@@ -113,6 +113,11 @@ class _Carriages:
         x, y, z = (f"position_min and position_max of {section[axis]}" for axis in "xyz")
         return (x, y, z)
 
+    def axes(self) -> dict[str, str]:
+        """Return the axis of each carriage by name."""
+        rails = {**self.first, **{name: rail for name, (rail, _) in self.second.items()}, **self.extra}
+        return {name: rail.axis for name, rail in rails.items()}
+
     def find(self, reader: SectionReader, option: Option[T], name: str) -> RailDescription:
         """Return a first or second carriage; raises ConfigError."""
         if name in self.first:
@@ -230,7 +235,8 @@ def _frame(
     motors: list[_Motor],
 ) -> Frame:
     own = tuple(motor.stepper for motor in motors if not motor.second)
-    kinematics = GenericCartesian(tuple((s.name, s.weights[:3]) for s in own), box_of(*axes))
+    runs_on = tuple((name, "xyz".index(axis)) for name, axis in carriages.axes().items())
+    kinematics = GenericCartesian(tuple((s.name, s.weights[:3]) for s in own), box_of(*axes), runs_on)
     if not kinematics.independent:
         raise ConfigError(
             Place(reading.config.path, 0),
