@@ -149,6 +149,13 @@ def _set_velocity_limit(job: ProgramContext, command: Command) -> bool:
     return True
 
 
+def _reset_velocity_limit(job: ProgramContext, command: Command) -> bool:
+    """RESET_VELOCITY_LIMIT: what the configuration says, of speeds and accelerations along the path."""
+    command.only_parameters(())
+    job.planner.reset_dynamics()
+    return True
+
+
 def _factor(job: ProgramContext, command: Command) -> bool:
     """M220, M221: percent in S; without it, nothing changes."""
     percent = numbers(command, "S").get("S")
@@ -243,7 +250,14 @@ _motors_off = _without_module("motor-off commands")
 WHILE_PRINTING = frozenset(
     (
         *("M73", "M105", "M112", "M114", "M117", "M118", "M204", "M220", "M221"),
-        *("GET_POSITION", "SET_GCODE_OFFSET", "SET_PRESSURE_ADVANCE", "SET_VELOCITY_LIMIT", "TUNING_TOWER"),
+        *(
+            "GET_POSITION",
+            "RESET_VELOCITY_LIMIT",
+            "SET_GCODE_OFFSET",
+            "SET_PRESSURE_ADVANCE",
+            "SET_VELOCITY_LIMIT",
+            "TUNING_TOWER",
+        ),
     )
 )
 """Commands that neither move nor wait: a client may give them while a job prints."""
@@ -276,6 +290,7 @@ HANDLERS: Mapping[str, Handler] = {
     "M205": _set_jerk,
     **dict.fromkeys(("M220", "M221"), _factor),
     "M400": _wait_for_moves,
+    "RESET_VELOCITY_LIMIT": _reset_velocity_limit,
     "SET_VELOCITY_LIMIT": _set_velocity_limit,
     **machine_commands.HANDLERS,
     **state_commands.HANDLERS,

@@ -32,6 +32,7 @@ BUILTIN_HELP: Final[Mapping[str, str]] = {
     "M400": "Wait until all moves are carried out",
     "M82": "Use absolute positions for E",
     "M83": "Use relative positions for E",
+    "RESET_VELOCITY_LIMIT": "Restore the configured velocities and accelerations",
     "RESTORE_GCODE_STATE": "Restore what SAVE_GCODE_STATE saved: NAME, MOVE, MOVE_SPEED",
     "RESTORE_DUAL_CARRIAGE_STATE": "Restore what SAVE_DUAL_CARRIAGE_STATE saved: NAME, MOVE, MOVE_SPEED",
     "SAVE_DUAL_CARRIAGE_STATE": "Save the modes of both carriages under NAME",

@@ -341,6 +341,10 @@ class Planner:
         self.drop_exclusion()
         self.plane = Plane.XY
         self._state.speed = DEFAULT_SPEED_MM_S
+        self.reset_dynamics()
+
+    def reset_dynamics(self) -> None:
+        """Take velocities, accelerations and limits of axes back to the configured ones."""
         self.accel = self.limits.max_accel
         self.max_velocity = self.limits.max_velocity
         self.square_corner_velocity = self.limits.square_corner_velocity

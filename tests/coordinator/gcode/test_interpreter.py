@@ -229,10 +229,11 @@ def test_accelerations() -> None:
         "G1 X50 E1", "M204 P1000", "G1 X60", "G1 X70 E1", "M204 S5000", "G1 X80", "G1 X90 E1",
         "M204 P6000 T4000", "G1 X100", "M204 T60000", "G1 X110",
         "SET_VELOCITY_LIMIT ACCEL=700 VELOCITY=50", "G1 X120 E1", "G1 X130",
+        "RESET_VELOCITY_LIMIT", "G1 X140",
     )  # fmt: skip
     print_and_travel = [10000, 3000, 2000, 3000, 2000, 1000, 5000, 5000, 4000]
-    assert t["accel"].tolist() == [10000, *print_and_travel, 10000, 700, 700]
-    assert t["cruise_v"][-1] == 50
+    assert t["accel"].tolist() == [10000, *print_and_travel, 10000, 700, 700, 10000]
+    assert t["cruise_v"][-2:].tolist() == [50, 100]
 
 
 def test_what_is_above_the_limits_is_cut_and_said() -> None:
