@@ -403,6 +403,19 @@ class SectionReader:
         self.section.stands_in = True
         return option.stand_in()
 
+    def get_or(self, option: Option[T], default: T) -> T:
+        """Return the value, or the DEFAULT that the section computes; raises ConfigError for a bad value."""
+        value = self.find(option)
+        if value is not None:
+            return value
+        self.show_default(option, default)
+        return default
+
+    def show_default(self, option: Option[T], default: T) -> None:
+        """Have macros see DEFAULT as the value of an option that is absent."""
+        if not self.has(option):
+            self.section.used[option.name] = option.setting("", default)
+
     def bad(self, option: Option[T], sentence: str) -> ConfigError:
         """Return the error for a value; the sentence continues after "option 'x' of [y] is 'z', "."""
         raw = self.section.options.get(option.name)

@@ -60,6 +60,7 @@ EXTRUDER_LIMITS: Final = (
     "max_extrude_ratio",
     "instantaneous_corner_velocity",
 )
+FILAMENT_ALONE: Final = ("max_extrude_only_velocity", "max_extrude_only_accel")
 AXIS_LIMITS: Final = tuple(f"max_{axis}_{what}" for axis in "xyz" for what in ("velocity", "accel"))
 DEFAULT_SPEED_MM_S = 25.0
 """Speed of moves before the first F word."""
@@ -437,6 +438,16 @@ class Planner:
             name = f"max_extrude_only_{what}" if letter == "E" else f"max_{letter.lower()}_{what}"
             most = getattr(self.limits, name) or getattr(self.limits, f"max_{what}")
             setattr(self._core.limits, name, min(check_number(name, asked, 1e-3), most))
+
+    @property
+    def axis_limits(self) -> dict[str, float]:
+        """The limits of X, Y, Z and of filament alone that hold now, by their names; mm, s."""
+        return {name: float(getattr(self._core.limits, name)) for name in (*AXIS_LIMITS, *FILAMENT_ALONE)}
+
+    @axis_limits.setter
+    def axis_limits(self, limits: Mapping[str, float]) -> None:
+        for name, limit in limits.items():
+            setattr(self._core.limits, name, limit)
 
     @property
     def cold(self) -> bool:

@@ -24,6 +24,7 @@ from nodes.support.errors import CanductorError
 _DYNAMICS: Final = (
     "accel",
     "travel_accel",
+    "axis_limits",
     "max_velocity",
     "square_corner_velocity",
     "minimum_cruise_ratio",

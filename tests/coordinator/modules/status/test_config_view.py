@@ -71,7 +71,15 @@ gcode:
 WANTED: dict[str, dict[str, Any]] = {
     "stepper_z": {"microsteps": 16, "rotation_distance": 8.0, "gear_ratio": [[3.0, 1.0], [20.0, 10.0]]},
     "stepper_y": {"gear_ratio": [], "full_steps_per_rotation": 200, "step_pin": "PA2"},
-    "probe": {"samples": 3, "samples_result": "median", "z_offset": 1.0, "pin": "PB0"},
+    "stepper_x": {
+        "homing_speed": 5.0,
+        "second_homing_speed": 2.5,
+        "homing_retract_speed": 5.0,
+        "homing_positive_dir": False,
+        "position_min": 0.0,
+    },
+    "extruder": {"max_extrude_cross_section": 0.64, "pressure_advance_smooth_time": 0.04},
+    "probe": {"lift_speed": 5.0, "samples": 3, "samples_result": "median", "z_offset": 1.0, "pin": "PB0"},
     "bed_mesh": {
         "mesh_min": [5.0, 6.0],
         "probe_count": [4, 4],
@@ -91,7 +99,7 @@ WANTED: dict[str, dict[str, Any]] = {
     "adxl345": {"cs_pin": "5", "axes_map": ["x", "-y", "z"], "rate": 3200},
     "gcode_macro park": {"description": "on", "variable_x": "5"},
     "mcu": {"canbus_uuid": "11aa22bb33cc"},
-    "printer": {"kinematics": "corexy", "max_velocity": 300.0},
+    "printer": {"kinematics": "corexy", "max_velocity": 300.0, "max_z_velocity": 300.0},
 }
 
 
@@ -105,7 +113,9 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> ProgramStage:
 
 def typed(value: object) -> object:
     """Return VALUE with the types of all numbers in it: 1, 1.0 and True are three things."""
-    return [typed(each) for each in value] if isinstance(value, list) else (type(value).__name__, value)
+    if isinstance(value, list):
+        return [typed(each) for each in value]
+    return type(value).__name__, round(value, 9) if isinstance(value, float) else value
 
 
 def view(machine: ProgramStage, what: str) -> Any:
