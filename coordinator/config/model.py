@@ -337,6 +337,27 @@ class MachineDescription:
     source: ConfigSource | None = None
     """The file, for what is saved into it; None: there is none."""
 
+    def with_weights(self, changed: Mapping[str, Weights]) -> "MachineDescription":
+        """Return the machine with motors (by name) that are other sums of the axes; no second carriages."""
+
+        def motors(steppers: tuple[StepperDescription, ...]) -> tuple[StepperDescription, ...]:
+            return tuple(
+                replace(stepper, function=StepFunction(weights=changed[stepper.name]))
+                if stepper.name in changed
+                else stepper
+                for stepper in steppers
+            )
+
+        changed_motors = motors(self.motors)
+        return replace(
+            self,
+            motors=changed_motors,
+            rails=tuple(replace(rail, steppers=motors(rail.steppers)) for rail in self.rails),
+            kinematics=self.kinematics.with_motors(
+                tuple((motor.name, motor.weights[:3]) for motor in changed_motors)
+            ),
+        )
+
     @property
     def second_carriage(self) -> RailDescription | None:
         """The rail of the second carriage, by a name that no axis has."""
@@ -376,4 +397,7 @@ class MachineDescription:
         followed = {extruder.stepper.name: extruder.name for extruder in self.extruders}
         followed |= {follower.stepper.name: follower.extruder for follower in self.extruder_steppers}
         names = tuple(extruder.name for extruder in self.extruders)
-        return ExtruderMotion(names, names[0] if names else "", followed)
+        steppers = [extruder.stepper for extruder in self.extruders]
+        steppers += [follower.stepper for follower in self.extruder_steppers]
+        turns = {stepper.name: stepper.rotation_distance for stepper in steppers}
+        return ExtruderMotion(names, names[0] if names else "", followed, turns)

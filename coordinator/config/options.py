@@ -169,19 +169,20 @@ class BoolOption(Option[bool]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChoiceOption(Option[str]):
-    """One word of several."""
+    """One word of several, in capitals or not."""
 
     choices: tuple[str, ...]
     unsupported: tuple[str, ...] = ()
     """Words known from other hosts that are not supported yet."""
 
     def parse(self, text: str) -> str:
-        """Return the word."""
-        if text in self.unsupported:
+        """Return the word as it stands among the choices."""
+        if text.lower() in (word.lower() for word in self.unsupported):
             raise NotBuilt
-        if text not in self.choices:
-            raise BadValue
-        return text
+        for word in self.choices:
+            if word.lower() == text.lower():
+                return word
+        raise BadValue
 
     def rule(self) -> str:
         """Return the values allowed."""
@@ -401,6 +402,19 @@ class SectionReader:
             self.section.report(ConfigError(self.place, lack))
         self.section.stands_in = True
         return option.stand_in()
+
+    def get_or(self, option: Option[T], default: T) -> T:
+        """Return the value, or the DEFAULT that the section computes; raises ConfigError for a bad value."""
+        value = self.find(option)
+        if value is not None:
+            return value
+        self.show_default(option, default)
+        return default
+
+    def show_default(self, option: Option[T], default: T) -> None:
+        """Have macros see DEFAULT as the value of an option that is absent."""
+        if not self.has(option):
+            self.section.used[option.name] = option.setting("", default)
 
     def bad(self, option: Option[T], sentence: str) -> ConfigError:
         """Return the error for a value; the sentence continues after "option 'x' of [y] is 'z', "."""

@@ -268,6 +268,10 @@ class ProgramContext(ABC):
         """Return COMMAND with what holds where it stands."""
 
     @abstractmethod
+    def knows(self, name: str) -> bool:
+        """Whether NAME is a command."""
+
+    @abstractmethod
     def follow(self, command: Command, reading: Reading) -> bool:
         """Do what READING says; False: the planner has to be emptied first."""
 

@@ -12,6 +12,7 @@ from functools import partial
 from coordinator.gcode.absent_commands import ABSENT
 from coordinator.gcode.builtins import basic as basic_commands
 from coordinator.gcode.builtins import machine as machine_commands
+from coordinator.gcode.builtins import tuning
 from coordinator.gcode.commands import (
     NO_WORDS,
     AtStandstill,
@@ -70,6 +71,8 @@ class _Inner:
     """Of the line that is being carried out."""
     where: Callable[[int], str] | None = None
     """Names the place of a line."""
+    comes_before: bool = False
+    """Whether they come before a line, which is read again then."""
 
     @property
     def place(self) -> str:
@@ -144,6 +147,7 @@ class Job(ProgramContext):
         for set_up in vocabulary.set_ups:
             set_up(planner)
         machine_commands.begin(self)
+        tuning.watch(self)
 
     @property
     def name(self) -> str:
@@ -221,6 +225,8 @@ class Job(ProgramContext):
         program = self.program
         feed = self.planner.feed(program.data, program.start, len(program.data), final=program.final)
         program.start = feed.offset
+        if self._tower_comes_first():
+            return
         if feed.status is FeedStatus.OTHER_LINE:
             self._other_line()
         elif feed.status is not FeedStatus.NEED_DATA:
@@ -267,6 +273,8 @@ class Job(ProgramContext):
         lines = self.planner.lines
         feed = self.planner.feed(inner.data, inner.start, end, final=True)
         self.planner.lines = lines
+        if self._tower_comes_first():
+            return
         if feed.status is FeedStatus.OTHER_LINE:
             if not self._do(inner.data[inner.start : end]):
                 self._events.append(Full())
@@ -289,9 +297,23 @@ class Job(ProgramContext):
         except (WordError, ValueError) as problem:
             raise self._error(str(problem)) from None
 
+    def _tower_comes_first(self) -> bool:
+        """Whether the line that the planner left prints at another height: its tower's command comes first.
+
+        The line is read again then.
+        """
+        z_mm = self.planner.new_height_mm
+        if z_mm is None:
+            return False
+        if line := tuning.reach(self, z_mm):
+            if len(self._inner) >= MAX_DEPTH:
+                raise self._error(self._too_deep(tuning.NAME))
+            self._inner.append(_Inner(tuning.NAME, line.encode(), comes_before=True))
+        return True
+
     def _inner_done(self) -> None:
-        self._inner.pop()
-        if not self._inner:
+        done = self._inner.pop()
+        if not self._inner and not (isinstance(done, _Inner) and done.comes_before):
             self.planner.line_done()
 
     def _do(self, line: bytes, hint: str = "") -> bool:
@@ -366,6 +388,11 @@ class Job(ProgramContext):
         return Call(
             command, self.line, position, planner.homed, callers, extruder, figures, self.while_printing
         )
+
+    def knows(self, name: str) -> bool:
+        """Whether NAME is a command."""
+        known = name in self.vocabulary.commands or name in basic_commands.HANDLERS
+        return known or machine_commands.is_tool(name)
 
     def follow(self, command: Command, reading: Reading) -> bool:
         """Do what READING says; False: the planner has to be emptied first."""

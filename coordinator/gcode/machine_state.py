@@ -7,6 +7,7 @@ change to step generation at its print time.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from coordinator.gcode.tuning_tower import TuningTower
 from coordinator.kinematics.base import Weights
 from coordinator.kinematics.dual_carriage import CarriageState, DualCarriage
 from coordinator.kinematics.extruder import ExtruderMotion
@@ -94,6 +95,8 @@ class MachineState:
     """What motors (by name) follow whose axes are corrected; others follow what they are described to."""
     surface: Surface | None = None
     """The shape of the bed that Z follows; None: a plane."""
+    tower: TuningTower | None = None
+    """A value that changes with the height of what is printed."""
 
     @property
     def active(self) -> Extruder | None:

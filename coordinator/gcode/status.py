@@ -28,7 +28,7 @@ def motion_figures(planner: Planner, machine: MachineState) -> Mapping[str, Mapp
         "print_time": planner.print_time_end_s,
         "estimated_print_time": planner.print_time_end_s,
         "stalls": 0,
-        "extra_axes": {},
+        "extra_axes": {} if active is None else {active.name: 3},
     }
     gcode_move = {
         "gcode_position": Place(*planner.gcode_position),
@@ -50,18 +50,24 @@ def _extruders(machine: MachineState) -> Mapping[str, Mapping[str, object]]:
     found: dict[str, dict[str, object]] = {}
     for stepper, queue in followed.items():
         name = stepper if stepper in machine.extruders else f"extruder_stepper {stepper}"
-        found[name] = {"motion_queue": queue or None}
+        follows = machine.extruders.get(queue)
+        found[name] = {
+            "motion_queue": queue or None,
+            "pressure_advance": 0.0 if follows is None else follows.pressure_advance_s,
+            "smooth_time": 0.0 if follows is None else follows.smooth_s,
+        }
     for name, extruder in machine.extruders.items():
         found[name] |= {"pressure_advance": extruder.pressure_advance_s, "smooth_time": extruder.smooth_s}
     return found
 
 
 def _carriages(machine: MachineState) -> Mapping[str, Mapping[str, object]]:
-    state = machine.carriage_state
-    if state is None:
+    state, both = machine.carriage_state, machine.carriages
+    if state is None or both is None:
         return {}
-    first, second = (mode.value for mode in state.modes)
-    return {"dual_carriage": {"carriage_0": first, "carriage_1": second}}
+    modes = [mode.value for mode in state.modes]
+    names = {carriage.name: mode for carriage, mode in zip(both.carriages, modes, strict=True)}
+    return {"dual_carriage": {"carriage_0": modes[0], "carriage_1": modes[1], "carriages": names}}
 
 
 def frames(figures: Mapping[str, Mapping[str, object]]) -> tuple[str, ...]:

@@ -120,6 +120,10 @@ class Kinematics(ABC):
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return what step generation computes for each rail."""
 
+    def with_motors(self, motors: "tuple[tuple[str, Point], ...]") -> "Kinematics":  # noqa: ARG002
+        """Return the machine whose MOTORS (by name) are these sums of X Y Z: itself where they are fixed."""
+        return self
+
     @abstractmethod
     def inverse(self, point: Point) -> tuple[float, ...]:
         """Return the rails' positions with the head at POINT; ValueError where it cannot be."""

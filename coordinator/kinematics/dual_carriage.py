@@ -13,10 +13,14 @@ along moves in any mode. Source: the definition of the modes.
 Everything here is a value; a change of mode happens at standstill and gives a new ``CarriageState``.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Final
 
 from coordinator.kinematics.base import Weights
+
+_ROUNDING_MM: Final = 1e-6
 
 
 class CarriageMode(Enum):
@@ -42,6 +46,8 @@ class Carriage:
     """Where it is after homing."""
     steppers: tuple[tuple[str, Weights], ...]
     """Names, and weights when this carriage is the primary."""
+    name: str = ""
+    """As status reports call it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +84,8 @@ class DualCarriage:
     carriages: tuple[Carriage, Carriage]
     safe_distance: float
     """mm that the carriages keep between their positions; 0: they pass each other."""
+    home_speed_mm_s: float = 50.0
+    """At which the axis is homed."""
 
     @property
     def home(self) -> CarriageState:
@@ -131,6 +139,34 @@ class DualCarriage:
             case _:
                 low, high = self._apart(low, high, at < other_at, other_at, self.safe_distance)
         return low, high
+
+    def order_of_moves(self, here: tuple[float, float], targets: tuple[float, float]) -> tuple[int, ...]:
+        """Return which carriages have to move from HERE to TARGETS, in an order that keeps them apart.
+
+        ValueError where there is none.
+        """
+        moving = [i for i in (0, 1) if abs(here[i] - targets[i]) > 1e-9]
+        for order in (moving, moving[::-1]):
+            if self._stay_apart(here, targets, order):
+                return tuple(order)
+        raise ValueError(
+            f"the carriages cannot go back to {targets[0]:.6g} and {targets[1]:.6g} mm one after the other"
+            " and stay apart; move them there by G1"
+        )
+
+    def _stay_apart(
+        self, here: tuple[float, float], targets: tuple[float, float], order: Sequence[int]
+    ) -> bool:
+        """Whether each of ORDER may go to its target while the other stands."""
+        at = list(here)
+        for carriage in order:
+            modes = [CarriageMode.INACTIVE, CarriageMode.INACTIVE]
+            modes[carriage] = CarriageMode.PRIMARY
+            low, high = self.limits(CarriageState((modes[0], modes[1]), (at[0], at[1])))
+            if not low - _ROUNDING_MM <= targets[carriage] <= high + _ROUNDING_MM:
+                return False
+            at[carriage] = targets[carriage]
+        return True
 
     def _apart(
         self,

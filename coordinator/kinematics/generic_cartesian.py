@@ -6,7 +6,7 @@ rows: p = M₃⁻¹·u₃; further motors (a second belt of one axis) follow fro
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace, linear
 from coordinator.kinematics.geometry import cross, dot, solve
@@ -22,6 +22,8 @@ class GenericCartesian(Kinematics):
     motors: tuple[tuple[str, Point], ...]
     """Each motor's name and its way per mm of X, Y and Z."""
     box: WorkSpace
+    carriages: tuple[tuple[str, int], ...] = ()
+    """Names, each with the axis (0 to 2) that it runs on."""
     name = "generic_cartesian"
     homing_order = (("x",), ("y",), ("z",))
     """Of axes here: a motor is no rail with an endstop of its own."""
@@ -39,6 +41,10 @@ class GenericCartesian(Kinematics):
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the motors' functions."""
         return tuple(linear(*weights) for _, weights in self.motors)
+
+    def with_motors(self, motors: tuple[tuple[str, Point], ...]) -> "GenericCartesian":
+        """Return the machine with these motors."""
+        return replace(self, motors=motors)
 
     def inverse(self, point: Point) -> tuple[float, ...]:
         """Return the motors' positions."""

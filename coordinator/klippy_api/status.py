@@ -11,7 +11,7 @@ from coordinator.klippy_api.subscription import Status
 from coordinator.modules.base import Module
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.programs.gcode_macro import GCodeMacro
-from coordinator.modules.status.config_view import config_view
+from coordinator.modules.status.config_view import config_view, config_warnings
 from coordinator.modules.status.machine_view import available_kb
 from coordinator.modules.status.print_stats import NOTHING
 from coordinator.runtime.machine import Machine
@@ -51,10 +51,7 @@ class _Fixed:
         modules = machine.modules
         view = config_view(modules.config, modules.settings, {})
         described = machine.description
-        warnings = [
-            *({"type": "unsupported", "message": str(found)} for found in described.unsupported),
-            *({"type": "note", "message": note} for note in (*described.notes, *modules.notes)),
-        ]
+        warnings = config_warnings(described.unsupported, (*described.notes, *modules.notes))
         self.machine = machine
         self.config = {"config": view["config"], "settings": view["settings"], "warnings": warnings}
         self.commands = {name: {"help": text} if text else {} for name, text in modules.command_help.items()}

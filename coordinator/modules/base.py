@@ -174,6 +174,10 @@ class Build:
         """Return an option's value, or None when it is absent; raises ConfigError."""
         return self.reader.find(option)
 
+    def get_or(self, option: Option[T], default: T) -> T:
+        """Return an option's value, or the DEFAULT that the section computes; raises ConfigError."""
+        return self.reader.get_or(option, default)
+
     def pin(self, option: PinOption) -> PinDescription:
         """Take the pin that a required option names; raises ConfigError."""
         return self._pins.claim(self.reader.get(option), option, self.reader.section)

@@ -15,11 +15,13 @@ from coordinator.gcode.absent_commands import ABSENT
 from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
 from coordinator.gcode.builtins.command_help import BUILTIN_HELP
 from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
+from coordinator.kinematics.generic_cartesian import GenericCartesian
 from coordinator.modules.base import Build, Device, Module
 from coordinator.modules.drivers.motor_power import MotorPower
 from coordinator.modules.drivers.stepper_buzz import StepperBuzz
 from coordinator.modules.heaters.sections import ExtruderHeaterSection
 from coordinator.modules.homing.homing import Homing
+from coordinator.modules.motion.stepper_carriages import StepperCarriages
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.programs.idle_timeout import IdleTimeout
 from coordinator.modules.programs.save_config import SaveConfig
@@ -149,6 +151,8 @@ class ModuleSet:
         self._live: ModuleContext | None = None
         self._homing = self.shared(Homing)
         self._motors = self.shared(MotorPower)
+        if isinstance(machine.kinematics, GenericCartesian):
+            self.shared(StepperCarriages)
         self.shared(ManualProbe)
         self.shared(Positions)
         self.shared(SaveConfig)

@@ -53,7 +53,7 @@ class FilamentForecast:
 
     def follow(self, weights: Mapping[str, tuple[float, float, float, float]]) -> None:
         """Record which steppers move filament in the next moves."""
-        moved = {name: axes[FILAMENT_AXIS] > 0 for name, axes in weights.items()}
+        moved = {name: axes[FILAMENT_AXIS] != 0 for name, axes in weights.items()}
         others = [name for name in self._active if name not in moved]
         self._active = (*others, *(name for name, moves in moved.items() if moves))
 

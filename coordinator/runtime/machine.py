@@ -278,6 +278,14 @@ class Machine:
                 await self._all_down.wait()
         return dict(self._confirmed_s)
 
+    def describe(self, description: MachineDescription) -> None:
+        """Take the motors to follow what DESCRIPTION says from now on; at standstill, on the control loop.
+
+        Nothing else of it may be new.
+        """
+        self.description = self.devices.description = description
+        self.stepper_positions.describe(description)
+
     # ------------------------------------------------------------------------------------------ parts
 
     @property

@@ -5,6 +5,7 @@ import contextlib
 from collections.abc import Callable
 from typing import Final
 
+from coordinator.config.saved import SaveError
 from coordinator.runtime.machine import Machine
 from nodes.clock.clock import Ticks, extend32
 from nodes.node.node import Node
@@ -79,6 +80,15 @@ class ModuleContext:
     def remove_saved(self, section: str) -> None:
         """Have SAVE_CONFIG remove a section that it wrote; raises SaveError for one that the user wrote."""
         self.machine.unsaved.remove(section)
+
+    def drop_saved(self, section: str) -> bool:
+        """Do the same and say so where it cannot be; return whether it is removed."""
+        try:
+            self.remove_saved(section)
+        except SaveError as error:
+            self.say(str(error))
+            return False
+        return True
 
     def stop(self, cause: str) -> None:
         """Stop the whole machine for safety: CAUSE is a sentence with what to do."""

@@ -23,6 +23,13 @@ class Runner(Protocol):
         TEXT is what they stand for: a job is paused first if there are words in it that pause or cancel one.
         """
 
+    def live_motion(self) -> tuple[Sequence[float], float, float] | None:
+        """Return where the head is now (X Y Z E, mm), and the speeds of head and filament, mm/s.
+
+        None: nothing moves it yet.
+        """
+        ...
+
     @property
     def remote_methods(self) -> frozenset[str]:
         """Names of the methods that clients have registered for programs to call; from any thread."""

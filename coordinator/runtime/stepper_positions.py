@@ -31,6 +31,11 @@ class StepperPositions:
             for number, carriage in enumerate(dual.carriages.carriages):
                 self._of_carriage |= {name: (number, weights) for name, weights in carriage.steppers}
 
+    def describe(self, described: MachineDescription) -> None:
+        """Take motors to follow what they are DESCRIBED to now; their positions are to be declared then."""
+        self._described = described
+        self._at_zero = {}
+
     def declare(
         self,
         position: Position,

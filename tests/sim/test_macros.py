@@ -37,16 +37,23 @@ JOB = [
 def test_they_are_read_again_where_nothing_is_connected(tmp_path: Path) -> None:
     """As a job does that goes on after a crash, and a program that is only planned."""
     description = Printer(tmp_path, MACROS).load()
-    before = JOB.index("PRINT_END")
+    tower = (
+        "TUNING_TOWER COMMAND=SET_PRESSURE_ADVANCE PARAMETER=ADVANCE START=0.05 STEP_DELTA=0 STEP_HEIGHT=1"
+    )
+    set_up = ("M203 X80", "M204 T900", "SET_EXTRUDER_ROTATION_DISTANCE EXTRUDER=extruder DISTANCE=20", tower)
+    lines = [*set_up, *JOB]
+    before = lines.index("PRINT_END")
     job = tmp_path / "job.gcode"
-    job.write_text("\n".join(JOB) + "\n", encoding="utf-8")
-    end_bytes = len("".join(f"{line}\n" for line in JOB[:before]))
+    job.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    end_bytes = len("".join(f"{line}\n" for line in lines[:before]))
     with Program.open(job) as program:
         reached = read_forward(description, program, end_bytes)
     assert reached.state.position[:3] == pytest.approx((90, 80, 1.2))
     assert reached.part_mm == pytest.approx(1.2)
     assert reached.variables["gcode_macro _STATE"]["changes"] == 1
     assert "SET_PRESSURE_ADVANCE EXTRUDER=extruder ADVANCE=0.05 SMOOTH_TIME=0.04" in reached.lines
+    assert set_up[2:] == (reached.lines[1], reached.lines[0])
+    assert (reached.dynamics["travel_accel"], reached.dynamics["axis_limits"]["max_x_velocity"]) == (900, 80)
 
 
 def told(stage: Served, text: str) -> bool:

@@ -121,6 +121,7 @@ def test_the_page_tells_all_that_there_is(tmp_path: Path) -> None:
         elsewhere = {
             "gcode_macro",
             "extruder1",
+            "dual_carriage",
             "tmc2208",
         } | of_others  # machines with a probe: test_probe.py
         assert fields.keys() - seen == elsewhere, "documented only"

@@ -140,10 +140,10 @@ def _read_extruder(
     limits = _limits(
         printer,
         space,
-        ratio=(reader.find(MAX_CROSS_SECTION) or usual_cross_section) / filament_area,
+        ratio=reader.get_or(MAX_CROSS_SECTION, usual_cross_section) / filament_area,
         only=(
-            reader.find(MAX_ONLY_VELOCITY) or printer.max_velocity * usual_ratio,
-            reader.find(MAX_ONLY_ACCEL) or printer.max_accel * usual_ratio,
+            reader.get_or(MAX_ONLY_VELOCITY, printer.max_velocity * usual_ratio),
+            reader.get_or(MAX_ONLY_ACCEL, printer.max_accel * usual_ratio),
             reader.get(MAX_ONLY_DISTANCE),
         ),
         corner_velocity=reader.get(CORNER_VELOCITY),

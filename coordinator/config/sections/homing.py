@@ -141,14 +141,15 @@ def _homing(
     positive_dir: bool,
 ) -> HomingDescription:
     speed = reader.get(HOMING_SPEED)
+    reader.show_default(POSITIVE_DIR, positive_dir)
     return HomingDescription(
         endstop_pin=endstop[0],
         virtual_endstop=endstop[1],
         position_endstop=position,
         speed=speed,
-        second_speed=reader.find(SECOND_HOMING_SPEED) or speed / 2,
+        second_speed=reader.get_or(SECOND_HOMING_SPEED, speed / 2),
         retract_distance=reader.get(RETRACT_DISTANCE),
-        retract_speed=reader.find(RETRACT_SPEED) or speed,
+        retract_speed=reader.get_or(RETRACT_SPEED, speed),
         positive_dir=positive_dir,
         accel=reader.find(ACCEL),
     )

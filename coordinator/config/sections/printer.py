@@ -102,9 +102,11 @@ def open_printer(section: RawSection) -> tuple[str, SectionReader]:
 
 def read_printer(reader: SectionReader) -> PrinterSection:
     """Return the limits of the whole machine; raises ConfigError."""
-    max_accel = reader.get(MAX_ACCEL_OPTION)
+    max_velocity, max_accel = reader.get(MAX_VELOCITY), reader.get(MAX_ACCEL_OPTION)
+    reader.show_default(AXIS_VELOCITIES[2], max_velocity)
+    reader.show_default(AXIS_ACCELS[2], max_accel)
     return PrinterSection(
-        max_velocity=reader.get(MAX_VELOCITY),
+        max_velocity=max_velocity,
         max_accel=max_accel,
         axis_velocity=tuple(reader.find(option) for option in AXIS_VELOCITIES),
         axis_accel=tuple(reader.find(option) for option in AXIS_ACCELS),

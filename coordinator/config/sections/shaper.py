@@ -75,10 +75,10 @@ def read_shapers(reading: Reading) -> tuple[ShaperDescription, ...]:
     every = reader.get(SHAPER_TYPE)
     shapers = []
     for axis, kind, frequency, damping in zip(AXES, AXIS_TYPES, FREQUENCIES, DAMPING_RATIOS, strict=True):
-        own, hz, ratio = reader.find(kind), reader.get(frequency), reader.get(damping)
+        own, hz, ratio = reader.get_or(kind, every), reader.get(frequency), reader.get(damping)
         if 0 < hz < MIN_FREQUENCY_HZ:
             raise reader.bad(frequency, f"must be 0 (not shaped) or at least {MIN_FREQUENCY_HZ:g} Hz")
         if hz:
-            shapers.append(ShaperDescription(axis, own or every, hz, ratio, reader.place_of(frequency)))
+            shapers.append(ShaperDescription(axis, own, hz, ratio, reader.place_of(frequency)))
     reading.finish(reader)
     return tuple(shapers)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 
 from coordinator.gcode.builtins import machine as machine_commands
 from coordinator.gcode.builtins import state as state_commands
+from coordinator.gcode.builtins import tuning as tuning_commands
 from coordinator.gcode.commands import AtStandstill, ProgramContext
 from coordinator.gcode.events import Done, Emergency, Reply, Wait
 from coordinator.gcode.parameters import bounded, numbers
@@ -96,8 +97,6 @@ def _set_accel(job: ProgramContext, command: Command) -> bool:
     _positive(command, words)
     if "S" in words:
         words = {"S": words["S"]}
-    elif len(words) == 1:
-        return True  # P or T alone has no effect, as users of such programs know it
     for accel in words.values():
         _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
     job.planner.set_accel_words(words)
@@ -117,8 +116,7 @@ def _limit_axes(what: str) -> Handler:
 
 def _set_jerk(job: ProgramContext, command: Command) -> bool:
     """M205: the lesser of X and Y is the speed at a right-angled corner; the rest means nothing here."""
-    words = numbers(command, "XYZEBSTJ")
-    corner = [words[letter] for letter in "XY" if letter in words]
+    corner = list(numbers(command, "XY").values())
     if corner:
         _positive(command, {"X or Y": min(corner)})
         job.planner.square_corner_velocity = min(*corner, job.planner.limits.square_corner_velocity)
@@ -148,6 +146,13 @@ def _set_velocity_limit(job: ProgramContext, command: Command) -> bool:
         planner.square_corner_velocity = corner
     if ratio is not None:
         planner.minimum_cruise_ratio = ratio
+    return True
+
+
+def _reset_velocity_limit(job: ProgramContext, command: Command) -> bool:
+    """RESET_VELOCITY_LIMIT: what the configuration says, of speeds and accelerations along the path."""
+    command.only_parameters(())
+    job.planner.reset_dynamics()
     return True
 
 
@@ -245,7 +250,14 @@ _motors_off = _without_module("motor-off commands")
 WHILE_PRINTING = frozenset(
     (
         *("M73", "M105", "M112", "M114", "M117", "M118", "M204", "M220", "M221"),
-        *("GET_POSITION", "SET_GCODE_OFFSET", "SET_PRESSURE_ADVANCE", "SET_VELOCITY_LIMIT"),
+        *(
+            "GET_POSITION",
+            "RESET_VELOCITY_LIMIT",
+            "SET_GCODE_OFFSET",
+            "SET_PRESSURE_ADVANCE",
+            "SET_VELOCITY_LIMIT",
+            "TUNING_TOWER",
+        ),
     )
 )
 """Commands that neither move nor wait: a client may give them while a job prints."""
@@ -278,7 +290,9 @@ HANDLERS: Mapping[str, Handler] = {
     "M205": _set_jerk,
     **dict.fromkeys(("M220", "M221"), _factor),
     "M400": _wait_for_moves,
+    "RESET_VELOCITY_LIMIT": _reset_velocity_limit,
     "SET_VELOCITY_LIMIT": _set_velocity_limit,
     **machine_commands.HANDLERS,
     **state_commands.HANDLERS,
+    **tuning_commands.HANDLERS,
 }

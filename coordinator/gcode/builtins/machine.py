@@ -6,20 +6,24 @@ generation as an event with its print time.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 
-from coordinator.gcode.commands import ProgramContext
+from coordinator.gcode.commands import Phases, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.events import PositionSet, Reply, ShaperChange, SmoothTimeChange, WeightsChange
 from coordinator.gcode.machine_state import DEFAULT_STATE, SHAPER_AXES, Extruder, MachineState, Shaper
-from coordinator.gcode.parameters import bounded, needed
-from coordinator.gcode.parser import Command, WordError, quoted
+from coordinator.gcode.parameters import bounded, flag, needed
+from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.kinematics.dual_carriage import CarriageMode, CarriageState, DualCarriage
+from coordinator.motion.planner.planner import FeedStatus
 from coordinator.motion.steps.shapers import split_kind
 
 MAX_FREQUENCY_HZ = 1000.0
 MAX_ADVANCE_S = 10.0
 MAX_SMOOTH_S = 0.2
+MIN_ROTATION_MM = 0.1
+MAX_ROTATION_MM = 10_000.0
 NO_TOOLS_FROM = 100
 """Numbers of tools from here on stand for none in what slicers write: T255, T1000."""
 _TOOL = re.compile(r"T\d{1,9}")
@@ -195,6 +199,32 @@ def sync_extruder_motion(job: ProgramContext, command: Command) -> bool:
     return True
 
 
+def set_extruder_rotation_distance(job: ProgramContext, command: Command) -> bool:
+    """EXTRUDER: a filament stepper; DISTANCE: its way per turn from a standstill on, below 0: reversed."""
+    values = command.only_parameters(("EXTRUDER", "DISTANCE"))
+    stepper = needed(command, values, "EXTRUDER")
+    motion = job.machine.filament
+    if motion is None:
+        raise WordError(f"{command.name} needs an extruder; this machine has none")
+    now_mm = motion.rotation_distance_mm(stepper)
+    if "DISTANCE" not in values:
+        job.emit(Reply(job.line, f"{stepper}: rotation_distance {now_mm:.6f} mm"))
+        return True
+    distance_mm = number(command.name, values, "DISTANCE")
+    if not MIN_ROTATION_MM <= abs(distance_mm) <= MAX_ROTATION_MM:
+        raise WordError(
+            f"DISTANCE of {command.name} is {distance_mm:g}; {MIN_ROTATION_MM:g} to {MAX_ROTATION_MM:g} mm"
+            " are possible, with a minus to turn the other way round"
+        )
+    if distance_mm != now_mm:
+        if not come_to_standstill(job):
+            return False
+        job.machine.filament = motion.set_rotation_distance(stepper, distance_mm)
+        _follow(job)
+    job.emit(Reply(job.line, f"{stepper}: rotation_distance {distance_mm:.6f} mm"))
+    return True
+
+
 # ---- Shapers ---------------------------------------------------------------------------------------------
 
 
@@ -277,26 +307,67 @@ def save_dual_carriage_state(job: ProgramContext, command: Command) -> bool:
 
 
 def restore_dual_carriage_state(job: ProgramContext, command: Command) -> bool:
-    """NAME: let both carriages do what they did then; with MOVE=0 only, they stay where they are."""
-    carriages, state = _dual(job, command)
+    """NAME: let both carriages do what they did then; without MOVE=0, where they were.
+
+    They go there one after the other, along their own axis only, at MOVE_SPEED (mm/s), else at the speed at
+    which the axis is homed.
+    """
+    carriages, _ = _dual(job, command)
     values = command.only_parameters(("NAME", "MOVE", "MOVE_SPEED"))
     name = values.get("NAME", DEFAULT_STATE)
     saved = job.machine.saved_carriages.get(name)
     if saved is None:
         raise WordError(f"{command.name} names the state {quoted(name)}, which is not saved")
-    if values.get("MOVE", "1") != "0":
-        raise WordError(f"{command.name} cannot move the carriages back; give MOVE=0, and move them by G1")
+    moves = "MOVE" not in values or flag(command, values, "MOVE")
+    speed_mm_s = bounded(command, values, "MOVE_SPEED", carriages.home_speed_mm_s, low=1e-3, high=1e6)
     if "XYZ"[carriages.axis] not in job.planner.homed:
         raise WordError(f"{command.name} comes before {'XYZ'[carriages.axis]} is homed; home with G28 first")
-    if not come_to_standstill(job):
-        return False
-    position = job.planner.toolhead_position[carriages.axis]
-    after = carriages.set_mode(state, position, saved.primary, CarriageMode.PRIMARY)
+    return job.follow(command, Phases(lambda job: _restore_carriages(job, saved, speed_mm_s if moves else 0)))
+
+
+def _restore_carriages(job: ProgramContext, saved: CarriageState, speed_mm_s: float) -> Iterator[Reading]:
+    """Move each carriage to its place in SAVED at SPEED_MM_S (0: none is moved), then restore the modes."""
+    carriages, state = job.machine.carriages, job.machine.carriage_state
+    assert carriages is not None
+    assert state is not None
+    if speed_mm_s:
+        here = state.at(job.planner.toolhead_position[carriages.axis])
+        for number_ in carriages.order_of_moves(here, saved.positions):
+            yield ProgramAction(partial(_set_carriage, carriage=number_, mode=CarriageMode.PRIMARY))
+            yield ProgramAction(
+                partial(_move_carriage, target_mm=saved.positions[number_], speed_mm_s=speed_mm_s)
+            )
+    yield ProgramAction(partial(_set_carriage, carriage=saved.primary, mode=CarriageMode.PRIMARY))
     other = saved.modes[1 - saved.primary]
     if other in {CarriageMode.COPY, CarriageMode.MIRROR}:
-        after = carriages.set_mode(after, after.position, 1 - saved.primary, other)
+        yield ProgramAction(partial(_set_carriage, carriage=1 - saved.primary, mode=other))
+
+
+def _set_carriage(job: ProgramContext, carriage: int, mode: CarriageMode) -> bool:
+    carriages, state = job.machine.carriages, job.machine.carriage_state
+    assert carriages is not None
+    assert state is not None
+    position = job.planner.toolhead_position[carriages.axis]
+    after = carriages.set_mode(state, position, carriage, mode)
+    if after.modes == state.modes:
+        return True
+    if not come_to_standstill(job):
+        return False
     _take_carriages(job, carriages, after)
     return True
+
+
+def _move_carriage(job: ProgramContext, target_mm: float, speed_mm_s: float) -> bool:
+    carriages = job.machine.carriages
+    assert carriages is not None
+    target = list(job.planner.toolhead_position)
+    assert job.machine.carriage_state is not None
+    low, high = carriages.limits(job.machine.carriage_state)
+    target[carriages.axis] = min(max(target_mm, low), high)  # but for rounding it is within
+    status = job.planner.move_to(target, min(speed_mm_s, job.planner.max_velocity))
+    if status is FeedStatus.LIMIT:
+        raise WordError(str(job.planner.fault))
+    return status is not FeedStatus.FULL
 
 
 def _dual(job: ProgramContext, command: Command) -> tuple[DualCarriage, CarriageState]:
@@ -329,6 +400,7 @@ HANDLERS = {
     "RESTORE_DUAL_CARRIAGE_STATE": restore_dual_carriage_state,
     "SAVE_DUAL_CARRIAGE_STATE": save_dual_carriage_state,
     "SET_DUAL_CARRIAGE": set_dual_carriage,
+    "SET_EXTRUDER_ROTATION_DISTANCE": set_extruder_rotation_distance,
     "SET_INPUT_SHAPER": set_input_shaper,
     "SET_PRESSURE_ADVANCE": set_pressure_advance,
     "SYNC_EXTRUDER_MOTION": sync_extruder_motion,

@@ -30,11 +30,14 @@ class HeaterRegistry(Module):
         self.sensors: dict[str, TemperatureSource] = {}
         """By the name in programs: heaters and the sections of sensors."""
         self._tags: dict[str, Heater | TemperatureSource] = {}
+        self._interrupts = 0
+        """How often a wait for a temperature was to end."""
         self._waiting_for: Value = None
         for name, help_, read in (
             ("M105", "Report all temperatures", self._report),
             ("TURN_OFF_HEATERS", "Turn all heaters off", self._turn_off),
             ("SET_HEATER_TEMPERATURE", "Set a heater's target: HEATER= TARGET=", self._set),
+            ("HEATER_INTERRUPT", "End the TEMPERATURE_WAIT that waits", self._interrupt),
         ):
             build.add_command(name, help_, read, while_printing=True)
         for name, help_, read in (
@@ -162,12 +165,23 @@ class HeaterRegistry(Module):
             )
 
         async def perform() -> None:
+            before = self._interrupts
             with self._waits(given["SENSOR"], low, high):
                 await source.next()
                 while source.celsius is None or not (source.is_sound and low <= source.celsius <= high):
+                    if self._interrupts != before:
+                        return
                     await source.next()
 
         return AtStandstill(perform)
+
+    def _interrupt(self, call: Call) -> Reading:
+        call.parameters()
+
+        def act(_: float) -> None:
+            self._interrupts += 1
+
+        return Synchronized(act)
 
     def _query(self, call: Call) -> Reading:
         given = call.parameters("NAME", "PULLUP")

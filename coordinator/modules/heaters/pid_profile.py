@@ -8,7 +8,7 @@ from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.config.sections.heater_options import PID_KD, PID_KI, PID_KP
 from coordinator.gcode.commands import Call, Immediate, Reading, Synchronized
 from coordinator.gcode.parameters import one, value
-from coordinator.gcode.parser import WordError, quoted
+from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import Heater
@@ -45,7 +45,12 @@ class PidProfiles(Module):
         self._of: dict[str, dict[str, PidGains]] = {}
         self._loaded: dict[str, str] = {}
         build.add_command(
-            "PID_PROFILE", "LOAD=, SAVE= or SET_VALUES= a profile of HEATER=, or GET_VALUES=1", self._read
+            "PID_PROFILE",
+            "LOAD=, SAVE=, REMOVE= or SET_VALUES= a profile of HEATER=, or GET_VALUES=1",
+            self._read,
+        )
+        build.add_command(
+            "SET_HEATER_PID", "Use other PID constants until a restart: HEATER= KP= KI= KD=", self._set_pid
         )
 
     def add(self, heater: str, name: str, gains: PidGains) -> None:
@@ -74,17 +79,33 @@ class PidProfiles(Module):
         if action == "GET_VALUES":
             return Immediate((self._report(unit),))
         if action == "REMOVE":
-            raise WordError("a profile is removed by hand: delete its section from the configuration")
+            return self._remove(unit, one(command, given, action, self._of.get(unit.key, {})))
         if unit.settings.kind != "pid":
             raise WordError(f"[{unit.name}] has no PID: its control is {unit.settings.kind}")
         if action == "LOAD":
             return self._load(call, given, unit, name)
         if action == "SET_VALUES":
-            gains = PidGains(*(value(command, given, letter) for letter in GAINS))
-            if min(gains.kp, gains.ki, gains.kd) < 0:
-                raise WordError("KP, KI and KD of PID_PROFILE must not be below 0")
-            return self._use(call, given, unit, name, gains)
+            return self._use(call, given, unit, name, _gains(command, given))
         return self._save(unit, name)
+
+    def _set_pid(self, call: Call) -> Reading:
+        command = call.command
+        given = call.parameters("HEATER", *GAINS)
+        unit = self._heaters.units[one(command, given, "HEATER", self._heaters.units)]
+        if unit.settings.kind != "pid":
+            raise WordError(f"[{unit.name}] has no PID: its control is {unit.settings.kind}")
+        gains = _gains(command, given)
+        return Synchronized(lambda _: _control(unit, gains))
+
+    def _remove(self, unit: Heater, name: str) -> Synchronized:
+        def act(_: float) -> None:
+            if (live := self._live) is None:
+                return
+            self._of[unit.key].pop(name, None)
+            if live.drop_saved(f"{KIND} {unit.key} {name}"):
+                live.say(f"profile {name} of {unit.key} was removed; SAVE_CONFIG removes it from the file")
+
+        return Synchronized(act)
 
     def _load(self, call: Call, given: Mapping[str, str], unit: Heater, name: str) -> Reading:
         gains = self._find(unit, name)
@@ -109,10 +130,7 @@ class PidProfiles(Module):
         def act(_: float) -> None:
             if not keep:
                 unit.set_target(0.0)
-            controller = unit.settings.by_pid(gains)
-            if isinstance(unit.controller, Pid):
-                controller.go_on_from(unit.controller)
-            unit.use(controller)
+            _control(unit, gains)
             if name != DEFAULT:
                 self.add(unit.key, name, gains)
             self._loaded[unit.key] = name
@@ -148,6 +166,21 @@ class PidProfiles(Module):
             return f"{unit.key} is not controlled by PID"
         values = " ".join(f"{option}: {text}" for option, text in _texts(unit.controller.gains).items())
         return f"{unit.key} has profile {self._loaded.get(unit.key, DEFAULT)}: {values}"
+
+
+def _gains(command: Command, given: Mapping[str, str]) -> PidGains:
+    gains = PidGains(*(value(command, given, letter) for letter in GAINS))
+    if min(gains.kp, gains.ki, gains.kd) < 0:
+        raise WordError(f"KP, KI and KD of {command.name} must not be below 0")
+    return gains
+
+
+def _control(unit: Heater, gains: PidGains) -> None:
+    """Control UNIT by other constants, without a jump of its power."""
+    controller = unit.settings.by_pid(gains)
+    if isinstance(unit.controller, Pid):
+        controller.go_on_from(unit.controller)
+    unit.use(controller)
 
 
 def _texts(gains: PidGains) -> dict[str, str]:

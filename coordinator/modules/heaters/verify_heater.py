@@ -60,7 +60,7 @@ class VerifyHeater(Module):
         self.heater = build.instance
         self.options = VerifyOptions(
             max_error_ks=build.get(MAX_ERROR),
-            check_gain_s=build.find(CHECK_GAIN_TIME) or default_options(self.heater).check_gain_s,
+            check_gain_s=build.get_or(CHECK_GAIN_TIME, default_options(self.heater).check_gain_s),
             hysteresis_k=build.get(HYSTERESIS),
             heating_gain_k=build.get(HEATING_GAIN),
         )

@@ -13,7 +13,7 @@ from contextlib import AbstractAsyncContextManager
 from typing import Final
 
 from coordinator.config.errors import ConfigError
-from coordinator.config.model import RailDescription
+from coordinator.config.model import MachineDescription, RailDescription
 from coordinator.gcode.commands import AtStandstill, Call, Phases, ProgramContext, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import Command
@@ -57,6 +57,11 @@ class Homing(Module):
         self._probe: ProbeEndstop | None = None
         build.add_command("M119", "Report which endstops are pressed", self._read_query)
         build.add_command("QUERY_ENDSTOPS", "Report which endstops are pressed", self._read_query)
+
+    def follow(self, described: MachineDescription) -> None:
+        """Home the machine as it is DESCRIBED now: its motors follow other sums of the axes."""
+        self._described = described
+        self._approaches = approaches(described)
 
     def status(self) -> Mapping[str, Value]:
         """Report which endstops were pressed at the last query."""

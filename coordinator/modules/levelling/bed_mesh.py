@@ -363,8 +363,14 @@ class BedMesh(Module):
 
     def _remove(self, name: str) -> None:
         self.profiles = {other: mesh for other, mesh in self.profiles.items() if other != name}
-        if (live := self._live) is not None:
-            live.soon_on_loop(lambda: live.remove_saved(f"bed_mesh {name}"))
+        live = self._live
+        if live is None:
+            return
+
+        def drop() -> None:
+            live.drop_saved(f"bed_mesh {name}")
+
+        live.soon_on_loop(drop)
 
     def _read_clear(self, call: Call) -> Reading:
         call.parameters()

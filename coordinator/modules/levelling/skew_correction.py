@@ -116,7 +116,7 @@ class Skews(Module):
             ("SET_SKEW", "Correct what was measured: XY=AC,BD,AD XZ= YZ=, or CLEAR=1", self._set),
             ("GET_CURRENT_SKEW", "Report the skew that is corrected", self._report),
             ("CALC_MEASURED_SKEW", "Report the skew that the lengths AC BD AD mean", self._calculate),
-            ("SKEW_PROFILE", "LOAD or SAVE a profile by its name", self._manage),
+            ("SKEW_PROFILE", "LOAD, SAVE or REMOVE a profile by its name", self._manage),
             (RESTORE, "Restore the skew that was corrected before a crash", self._restore),
         ):
             build.add_command(name, help_, read)
@@ -226,12 +226,15 @@ class Skews(Module):
         return Immediate((f"Calculated skew: {_shown(skew_of(call.command, ac, bd, ad))}",))
 
     def _manage(self, call: Call) -> Reading:
-        given = call.parameters("LOAD", "SAVE")
+        given = call.parameters("LOAD", "SAVE", "REMOVE")
         if len(given) != 1:
-            raise WordError("SKEW_PROFILE takes LOAD=name or SAVE=name; to remove one, remove its section")
+            raise WordError("SKEW_PROFILE takes one of LOAD=name, SAVE=name and REMOVE=name")
         if "LOAD" in given:
             name = one(call.command, given, "LOAD", self._profiles)
             return ProgramAction(lambda job: self.take(job, self._profiles[name], name))
+        if "REMOVE" in given:
+            name = one(call.command, given, "REMOVE", self._profiles)
+            return Immediate(act=lambda: self._remove(name))
         name = given["SAVE"]
         if not name.isidentifier():
             raise WordError(
@@ -239,10 +242,20 @@ class Skews(Module):
             )
         return Immediate((f"skew profile {name} is saved; SAVE_CONFIG writes it",), lambda: self._save(name))
 
+    def _remove(self, name: str) -> None:
+        self._profiles = {other: skew for other, skew in self._profiles.items() if other != name}
+        if (live := self._live) is not None:
+            live.soon_on_loop(lambda: _drop(live, name))
+
     def _save(self, name: str) -> None:
         skew = self._profiles[name] = self.now
         if (live := self._live) is not None:
             live.soon_on_loop(lambda: _keep(live, name, skew))
+
+
+def _drop(live: "ModuleContext", name: str) -> None:
+    if live.drop_saved(f"skew_correction {name}"):
+        live.say(f"skew profile {name} is removed; SAVE_CONFIG removes it from the file")
 
 
 def _keep(live: "ModuleContext", name: str, skew: Skew) -> None:

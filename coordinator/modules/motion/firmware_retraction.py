@@ -71,6 +71,7 @@ class FirmwareRetraction(Module):
         for name, help_, read in (
             ("SET_RETRACTION", "Change the settings of G10 and G11", self._set),
             ("GET_RETRACTION", "Report the settings of G10 and G11", self._get),
+            ("RESET_RETRACTION", "Restore the configured settings", self._reset),
             (
                 "CLEAR_RETRACTION",
                 "Restore the configured settings, and forget that the filament is retracted",
@@ -136,6 +137,12 @@ class FirmwareRetraction(Module):
     def _get(self, _call: Call) -> Reading:
         texts = [f"{name.upper()}={value:g}" for name, value in vars(self._settings).items()]
         return Immediate((" ".join(texts),))
+
+    def _reset(self, _call: Call) -> Reading:
+        def act() -> None:
+            self._settings = self._configured
+
+        return Immediate(act=act)
 
     def _clear(self, _call: Call) -> Reading:
         def act() -> None:

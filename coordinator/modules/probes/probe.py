@@ -169,7 +169,7 @@ class Probe(ProbeEndstop):
         speed = build.get(SPEED)
         self.measuring = Measuring(
             speed,
-            build.find(LIFT_SPEED) or speed,
+            build.get_or(LIFT_SPEED, speed),
             build.get(RETRACT),
             SampleRules(
                 samples=build.get(SAMPLES),

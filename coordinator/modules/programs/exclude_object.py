@@ -1,7 +1,8 @@
 """[exclude_object]: objects of a program that need not be printed to their end.
 
 A slicer says where each object begins and ends. Moves of one that is excluded are followed but not made; the
-filament then is where the next object expects it, neither further forward nor further back.
+filament then is where the next object expects it, neither further forward nor further back. Objects do not
+stand within one another: the begin of one ends the one before.
 """
 
 import json
@@ -104,7 +105,10 @@ class ExcludeObject(Module):
         if flag(call.command, values, "RESET"):
             return ProgramAction(self._reset)
         if "NAME" not in values:
-            return Immediate((f"Known objects: {' '.join(self._objects) or 'none'}",))
+            known = " ".join(self._objects) or "none"
+            if flag(call.command, values, "JSON"):
+                known = json.dumps([_status(found) for found in self._objects.values()])
+            return Immediate((f"Known objects: {known}",))
         found = _Object(
             values["NAME"].upper(),
             _point(call.command, values["CENTER"].split(",")) if "CENTER" in values else None,
@@ -138,9 +142,14 @@ class ExcludeObject(Module):
         return ProgramAction(act)
 
     def _end(self, call: Call) -> Reading:
-        call.parameters("NAME")
+        name = call.parameters("NAME").get("NAME", "").upper()
 
         def act(job: ProgramContext) -> bool:
+            if self._current is None or name not in {"", self._current}:
+                # An object within another one: what comes behind it is of none, or still of the newer one.
+                now = "no object is being printed" if self._current is None else f"it is {self._current}"
+                job.notice(f"EXCLUDE_OBJECT_END {name}".strip(), f"{now}: the line is ignored")
+                return True
             done = self._make_moves(job)
             if done:
                 self._current = None

@@ -14,6 +14,7 @@ def _probe() -> Status:
     return {"name": "probe", "last_query": False, "last_probe_position": place, "last_z_result": 0.0}
 
 
+_NO_TEMPERATURES: Final = {"temperature": 0.0, "measured_min_temp": 0.0, "measured_max_temp": 0.0}
 _KINDS: Final[Mapping[str, Callable[[], Status]]] = {
     "bed_mesh": lambda: {
         "profile_name": "",
@@ -25,9 +26,15 @@ _KINDS: Final[Mapping[str, Callable[[], Status]]] = {
     },
     **dict.fromkeys(("z_tilt", "z_tilt_ng", "quad_gantry_level"), lambda: {"applied": False}),
     **dict.fromkeys(
-        ("probe", "bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe", "dockable_probe"),
+        ("probe", "bltouch", "smart_effector", "probe_eddy_current", "dockable_probe"),
         _probe,
     ),
+    "load_cell_probe": lambda: {
+        **_probe(),
+        "endstop_tare_counts": None,
+        "last_trigger_time": None,
+        "is_last_tap_valid": False,
+    },
     **dict.fromkeys(
         ("led", "neopixel", "dotstar", "pca9533", "pca9632"), lambda: {"color_data": [[0.0, 0.0, 0.0, 0.0]]}
     ),
@@ -38,7 +45,27 @@ _KINDS: Final[Mapping[str, Callable[[], Status]]] = {
         "accepted_screws": None,
     },
     "screws_tilt_adjust": lambda: {"error": False, "max_deviation": None, "results": {}},
-    "z_thermal_adjust": lambda: {"enabled": False, "current_z_adjust": 0.0, "temperature": 0.0},
+    "z_thermal_adjust": lambda: {
+        "enabled": False,
+        "current_z_adjust": 0.0,
+        "z_adjust_ref_temperature": 0.0,
+        **_NO_TEMPERATURES,
+    },
+    **dict.fromkeys(("temperature_probe", "temperature_combined"), lambda: {**_NO_TEMPERATURES}),
+    "angle": lambda: {"temperature": None},
+    "canbus_stats": lambda: {"rx_error": None, "tx_error": None, "tx_retries": None, "bus_state": None},
+    "load_cell": lambda: {
+        "is_calibrated": False,
+        "counts_per_gram": None,
+        "reference_tare_counts": None,
+        "tare_counts": None,
+        "force_g": None,
+        "min_force_g": None,
+        "max_force_g": None,
+        "errors": 0,
+        "overflows": 0,
+        "sample_rate": 0.0,
+    },
     **dict.fromkeys(("servo", "pwm_tool", "pwm_cycle_time", "output_pin"), lambda: {"value": 0.0}),
     "filament_motion_sensor": lambda: {"enabled": False, "filament_detected": False},
     **dict.fromkeys(
@@ -52,7 +79,7 @@ _KINDS: Final[Mapping[str, Callable[[], Status]]] = {
     **dict.fromkeys(
         ("heater_bed", "heater_generic"), lambda: {"temperature": 0.0, "target": 0.0, "power": 0.0}
     ),
-    "temperature_sensor": lambda: {"temperature": 0.0, "measured_min_temp": 0.0, "measured_max_temp": 0.0},
+    "temperature_sensor": lambda: {**_NO_TEMPERATURES},
     "temperature_fan": lambda: {"temperature": 0.0, "target": 0.0, "speed": 0.0, "rpm": None},
     **dict.fromkeys(
         ("fan", "fan_generic", "heater_fan", "controller_fan"), lambda: {"speed": 0.0, "rpm": None}

@@ -1,18 +1,21 @@
 """``printer.configfile``: ``config`` has every option as text, ``settings`` as what it was read as."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from enum import Enum
 from typing import Final
 
 from coordinator.modules.status.lazy_status import LazyStatus
+from nodes.support.numbers import read_decimal
 
 
 def config_view(
     config: Mapping[str, Mapping[str, str]],
     settings: Mapping[str, Mapping[str, object]],
     pending: Mapping[str, object],
+    warnings: Iterable[Mapping[str, str]] = (),
 ) -> LazyStatus:
-    """Return options by section: CONFIG as text, SETTINGS as values and defaults; and what is PENDING."""
+    """Return options by section: CONFIG as text, SETTINGS as values and defaults; PENDING; WARNINGS."""
     return LazyStatus(
         config=lambda: {section: dict(options) for section, options in config.items()},
         settings=lambda: {
@@ -21,8 +24,16 @@ def config_view(
         },
         save_config_pending=lambda: bool(pending.get("save_config_pending", False)),
         save_config_pending_items=lambda: pending.get("save_config_pending_items", {}),
-        warnings=list,
+        warnings=lambda: [dict(warning) for warning in warnings],
     )
+
+
+def config_warnings(unsupported: Iterable[object], notes: Iterable[str]) -> list[dict[str, str]]:
+    """Return what does not act (UNSUPPORTED), and NOTES, as ``warnings``."""
+    return [
+        *({"type": "unsupported", "message": str(found)} for found in unsupported),
+        *({"type": "note", "message": note} for note in notes),
+    ]
 
 
 def _values(section: str, texts: Mapping[str, str], values: Mapping[str, object]) -> dict[str, object]:
@@ -44,27 +55,46 @@ def _plain(value: object) -> object:
     return None
 
 
-_LISTS: Final = frozenset(
+_COUNTS: Final = frozenset(("probe_count", "mesh_pps"))
+_LISTS: Final = _COUNTS | frozenset(
     (
-        *("mesh_min", "mesh_max", "mesh_origin", "probe_count", "mesh_pps", "zero_reference_position"),
+        *("mesh_min", "mesh_max", "mesh_origin", "zero_reference_position"),
         *("gantry_corners", "points", "z_positions", "nozzle_xy_position", "switch_xy_position"),
-        *("bed_xy_position", "probe_points", "chips", "axes_map", "initial_red", "homing_position"),
-        *(f"screw{number}" for number in range(1, 10)),
+        *("bed_xy_position", "probe_points", "homing_position", "home_xy_position", "calibration_position"),
+        *("dock_position", "approach_position", "detach_position", "extract_position", "insert_position"),
+        *(f"screw{number}" for number in range(1, 100)),
+        *(f"screw{number}_fine_adjust" for number in range(1, 100)),
         *(f"faulty_region_{number}_{end}" for number in range(1, 100) for end in ("min", "max")),
     )
 )
-"""Options of sections without a module that are lists of numbers, or of such lists over several lines."""
+"""Options without a reader of their own that are lists of numbers, or of such lists over several lines."""
+_WORDS: Final = frozenset(("axes_map", "chips", "heaters", "steppers", "color_order"))
+"""Such ones that are lists of words."""
+_TEXTS: Final = re.compile(r".*_pin|pin|.*_name|name|i2c_bus|spi_bus|cs_pin|.*gcode|serial|description")
+"""Such ones that are text, whatever it looks like."""
+_WHOLE: Final = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 
 
 def _typed(section: str, option: str, text: str) -> object:
     """Return the value of an option that no reader knows, as the peer's users know it."""
-    if section.startswith("gcode_macro ") or option not in _LISTS:
+    if section.startswith("gcode_macro ") or _TEXTS.fullmatch(option):
+        return text
+    if option in _WORDS:
+        return [word.strip() for word in text.split(",") if word.strip()]
+    if option not in _LISTS:
         return _guess(text)
-    lines = [[_guess(word) for word in line.split(",")] for line in text.split("\n") if line.strip()]
+    number = _guess if option in _COUNTS else _decimal
+    lines = [[number(word) for word in line.split(",")] for line in text.split("\n") if line.strip()]
     found: object = lines[0] if len(lines) == 1 else lines
     if option == "probe_count" and isinstance(found, list) and len(found) == 1:
         return found * 2
     return found
+
+
+def _decimal(text: str) -> object:
+    """Return the number TEXT, else the text."""
+    value = read_decimal(text.strip())
+    return text if value is None else value
 
 
 def _guess(text: str) -> object:
@@ -74,9 +104,6 @@ def _guess(text: str) -> object:
         return True
     if word.lower() in ("false", "no", "off"):
         return False
-    for kind in (int, float):
-        try:
-            return kind(word)
-        except ValueError:
-            continue
-    return text
+    if _WHOLE.fullmatch(word):
+        return int(word)
+    return _decimal(text)

@@ -2,10 +2,11 @@
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from coordinator.gcode.place import Place
 from coordinator.modules.base import Modules
 from coordinator.modules.status.lazy_status import LazyStatus
 from coordinator.runtime.module_context import ModuleContext
@@ -30,6 +31,11 @@ def machine_view(modules: Modules, live: "ModuleContext | None") -> Mapping[str,
             cputime=lambda: round(time.process_time(), 3),
             memavail=available_kb,
         ),
+        "motion_report": LazyStatus(
+            live_position=lambda: Place(*_motion(live)[0]),
+            live_velocity=lambda: round(_motion(live)[1], 3),
+            live_extruder_velocity=lambda: round(_motion(live)[2], 4),
+        ),
         "webhooks": {
             "state": "ready" if stopped is None else "shutdown",
             "state_message": "Printer is ready" if stopped is None else str(stopped),
@@ -40,6 +46,12 @@ def machine_view(modules: Modules, live: "ModuleContext | None") -> Mapping[str,
             "printing_time": 0.0,
         },
     }
+
+
+def _motion(live: "ModuleContext | None") -> tuple[Sequence[float], float, float]:
+    """Return place and speeds of the head; on the control loop."""
+    runner = None if live is None else live.machine.runner
+    return (None if runner is None else runner.live_motion()) or ((0.0,) * 4, 0.0, 0.0)
 
 
 def _node(node: "Node") -> Mapping[str, object]:

@@ -14,7 +14,7 @@ from coordinator.gcode.commands import Call
 from coordinator.gcode.templates.renderer import template_renderer
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.absent_status import absent_statuses
-from coordinator.modules.status.config_view import config_view
+from coordinator.modules.status.config_view import config_view, config_warnings
 from coordinator.modules.status.machine_view import machine_view
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.runtime.module_context import ModuleContext
@@ -92,8 +92,16 @@ class PrinterStatus(Module):
         found.update(absent_statuses(modules.config))
         found.update((name, {}) for name in modules.names(Module) if name in modules.config)
         found.update((name, self._for_macros(status)) for name, status in modules.status().items())
-        found["configfile"] = config_view(modules.config, modules.settings, found.get("configfile", {}))
+        found["configfile"] = config_view(
+            modules.config, modules.settings, found.get("configfile", {}), self._warnings(modules)
+        )
         return found
+
+    def _warnings(self, modules: Modules) -> list[dict[str, str]]:
+        if self._live is None:
+            return []
+        described = self._live.machine.description
+        return config_warnings(described.unsupported, (*described.notes, *modules.notes))
 
     def _for_macros(self, status: Mapping[str, object]) -> Mapping[str, object]:
         """Return STATUS with numbers that macros can compare, also where nothing was measured yet.

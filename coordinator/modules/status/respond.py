@@ -24,7 +24,7 @@ class Respond(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         usual = PREFIXES[build.get(TYPE)]
-        self._prefix = build.find(PREFIX) or usual
+        self._prefix = build.get_or(PREFIX, usual)
         build.add_command("M118", "Show a line", self._echo, while_printing=True)
         build.add_command(
             "RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, while_printing=True

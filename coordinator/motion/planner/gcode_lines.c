@@ -288,18 +288,24 @@ static void set_origin(struct gcode_state *state, const struct gcode_words *word
 }
 
 int gcode_accel(struct planner *planner, const struct gcode_words *words) {
-    const int both = words->given >> GCODE_P & words->given >> GCODE_T & 1 ? 1 : 0;
-    double accel = planner->accel;
-    if (words->given >> GCODE_S & 1)
-        accel = words->value[GCODE_S];
-    else if (both)
-        accel = fmin(words->value[GCODE_P], words->value[GCODE_T]);
+    const uint32_t print = words->given >> GCODE_P & 1, travel = words->given >> GCODE_T & 1;
+    double accel = planner->accel, travel_accel = planner->travel_accel;
+    if (words->given >> GCODE_S & 1) {
+        accel = travel_accel = words->value[GCODE_S];
+    } else if (print && travel) {
+        accel = travel_accel = fmin(words->value[GCODE_P], words->value[GCODE_T]);
+    } else if (print) {
+        accel = words->value[GCODE_P];
+    } else if (travel) {
+        travel_accel = words->value[GCODE_T];
+    }
     for (int i = GCODE_S; i <= GCODE_T; i++)
         if (words->given >> i & 1 && !(words->value[i] >= MIN_ACCEL))
             return -1;
-    if (!words->given || !(accel <= planner->limits.max_accel))
+    if (!words->given || !(fmax(accel, travel_accel) <= planner->limits.max_accel))
         return -1;
     planner->accel = accel;
+    planner->travel_accel = travel_accel;
     return 0;
 }
 
@@ -311,6 +317,21 @@ int gcode_move(struct gcode_state *state, struct planner *planner, const struct 
         return -1;
     state->speed = speed;
     return 0;
+}
+
+// Whether a move with these words prints at another height than the tower has seen.
+static int at_new_height(struct gcode_state *state, const struct gcode_words *words) {
+    double target[4];
+    if (state->excluded)
+        return 0;
+    gcode_target(state, words, target);
+    const double *here = state->position;
+    if (!(target[AXIS_E] > here[AXIS_E]) || target[AXIS_Z] == state->tower_z ||
+        (target[AXIS_X] == here[AXIS_X] && target[AXIS_Y] == here[AXIS_Y]))
+        return 0;
+    state->tower_next_z = target[AXIS_Z];
+    state->tower = GCODE_TOWER_DUE;
+    return 1;
 }
 
 // Whether the line was carried out; *STATUS says why not.
@@ -325,6 +346,8 @@ static int act(struct gcode_state *state, struct planner *planner, enum gcode_ki
         set_origin(state, words);
     if (kind == GCODE_BLANK || kind == GCODE_ORIGIN)
         return 1;
+    if (state->tower && at_new_height(state, words))
+        return 0;
     *status = GCODE_FULL;
     if (!planner_ready(planner))
         return 0;

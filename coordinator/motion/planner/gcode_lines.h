@@ -32,6 +32,8 @@ enum gcode_kind {
     GCODE_OTHER
 };
 enum gcode_plane { GCODE_XY, GCODE_ZX, GCODE_YZ };
+// Of gcode_state.tower.
+enum { GCODE_NO_TOWER, GCODE_TOWER, GCODE_TOWER_DUE };
 
 // An arc on its way: a polygon of PIECES, of which DONE are planned. Its corners lie on the arc (on a spiral
 // where the radii at its ends differ); it ends exactly where the line says.
@@ -69,6 +71,9 @@ struct gcode_state {
     int32_t excluded;     // whether moves only change position, and are not made
     uint32_t left_out;    // kinds of lines that are the caller's
     double filament_top;  // mm, the highest E so far
+    double tower_z;       // mm, height of the print that the caller knows of; a move that prints at another
+    double tower_next_z;  // one is the caller's turn: tower becomes DUE, tower_next_z is that height
+    int32_t tower;        // GCODE_TOWER: the caller wants to know the height of what is printed
     struct gcode_arc arc; // where arc.done < arc.pieces, it comes before the next line
 };
 
@@ -99,7 +104,8 @@ int gcode_arc_begin(struct gcode_state *state, struct planner *planner, const st
 // no (call again), GCODE_LIMIT when a piece is refused: nothing is left of it then.
 int gcode_arc_go_on(struct gcode_state *state, struct planner *planner);
 
-// Acts on the words of M204. Returns 0, or -1 with nothing changed when there is none, or one is too small,
+// Acts on the words of M204: S is for all moves, P for those with filament, T for others; of both P and T the
+// lower one is for all. Returns 0, or -1 with nothing changed when there is none, or one is too small,
 // or the acceleration above what is configured.
 int gcode_accel(struct planner *planner, const struct gcode_words *words);
 

@@ -60,6 +60,8 @@ EXTRUDER_LIMITS: Final = (
     "max_extrude_ratio",
     "instantaneous_corner_velocity",
 )
+FILAMENT_ALONE: Final = ("max_extrude_only_velocity", "max_extrude_only_accel")
+AXIS_LIMITS: Final = tuple(f"max_{axis}_{what}" for axis in "xyz" for what in ("velocity", "accel"))
 DEFAULT_SPEED_MM_S = 25.0
 """Speed of moves before the first F word."""
 RING_TRAPEZOIDS = int(lib.PLANNER_RING)
@@ -97,6 +99,8 @@ class Planner:
         self._count: Any = ffi.new("uint32_t *")
         self.limits = limits
         """What was configured; ``accel`` and the like never exceed it."""
+        self._extruder_limits = limits
+        """What was configured for the active extruder."""
         self._offset_mm = [0.0, 0.0, 0.0, 0.0]
         self.set_arc_precision()
 
@@ -329,7 +333,7 @@ class Planner:
     # ---- Modes ----
 
     def reset_modes(self) -> None:
-        """Take units, modes, speed and dynamics back to where a program begins.
+        """Take units, modes, speed, dynamics and limits of axes back to where a program begins.
 
         Positions, the G-code origin, what is homed and the factors (M220, M221) stay.
         """
@@ -338,24 +342,43 @@ class Planner:
         self.drop_exclusion()
         self.plane = Plane.XY
         self._state.speed = DEFAULT_SPEED_MM_S
+        self.reset_dynamics()
+
+    def reset_dynamics(self) -> None:
+        """Take velocities, accelerations and limits of axes back to the configured ones."""
         self.accel = self.limits.max_accel
         self.max_velocity = self.limits.max_velocity
         self.square_corner_velocity = self.limits.square_corner_velocity
         self.minimum_cruise_ratio = self.limits.minimum_cruise_ratio
+        self._take_limits(self.limits, AXIS_LIMITS)
+        self._take_limits(self._extruder_limits, EXTRUDER_LIMITS)
+
+    def _take_limits(self, limits: MotionLimits, names: Iterable[str]) -> None:
+        for name in names:
+            setattr(self._core.limits, name, getattr(limits, name))
 
     # ---- Speeds, accelerations and ranges; speeds in mm/s ----
 
     @property
     def accel(self) -> float:
-        """mm/s² (M204)."""
+        """mm/s² of moves with filament (M204); setting it sets ``travel_accel``, too."""
         return float(self._core.accel)
 
     @accel.setter
     def accel(self, accel: float) -> None:
         self.set_accel_words({"S": accel})
 
+    @property
+    def travel_accel(self) -> float:
+        """mm/s² of moves without filament (M204 T)."""
+        return float(self._core.travel_accel)
+
+    @travel_accel.setter
+    def travel_accel(self, accel: float) -> None:
+        self.set_accel_words({"T": accel})
+
     def set_accel_words(self, words: Mapping[str, float]) -> None:
-        """M204: S, or the lower of P (print) and T (travel); one of these alone has no effect."""
+        """M204: S of all moves, P of those with filament, T of others; the lower of P and T of all."""
         most = self.limits.max_accel
         capped = {key: min(check_number("the acceleration", a, 1e-3), most) for key, a in words.items()}
         if lib.gcode_accel(self._core, gcode_words(capped)):
@@ -417,6 +440,16 @@ class Planner:
             setattr(self._core.limits, name, min(check_number(name, asked, 1e-3), most))
 
     @property
+    def axis_limits(self) -> dict[str, float]:
+        """The limits of X, Y, Z and of filament alone that hold now, by their names; mm, s."""
+        return {name: float(getattr(self._core.limits, name)) for name in (*AXIS_LIMITS, *FILAMENT_ALONE)}
+
+    @axis_limits.setter
+    def axis_limits(self, limits: Mapping[str, float]) -> None:
+        for name, limit in limits.items():
+            setattr(self._core.limits, name, limit)
+
+    @property
     def cold(self) -> bool:
         """Whether moves of filament are refused."""
         return bool(self._core.cold)
@@ -428,8 +461,8 @@ class Planner:
     def set_extruder_limits(self, limits: MotionLimits) -> None:
         """Take over what LIMITS say of filament: another extruder is active."""
         check_limits(limits)
-        for name in EXTRUDER_LIMITS:
-            setattr(self._core.limits, name, getattr(limits, name))
+        self._extruder_limits = limits
+        self._take_limits(limits, EXTRUDER_LIMITS)
 
     # ---- Offsets ----
 
@@ -527,6 +560,18 @@ class Planner:
     def forget_line(self) -> None:
         """Forget what is left of a line: another program begins."""
         self._state.lines = self._state.arc.pieces = self._state.arc.done = 0
+
+    # ---- The height of what is printed ----
+
+    def watch_height(self, z_mm: float | None) -> None:
+        """Let ``feed`` stop before a move that prints at another height than Z_MM; None: no longer."""
+        self._state.tower = lib.GCODE_NO_TOWER if z_mm is None else lib.GCODE_TOWER
+        self._state.tower_z = 0.0 if z_mm is None else z_mm
+
+    @property
+    def new_height_mm(self) -> float | None:
+        """The height for which ``feed`` has stopped, in the machine's frame; None: it did not."""
+        return float(self._state.tower_next_z) if self._state.tower == lib.GCODE_TOWER_DUE else None
 
     # ---- What is left out ----
 

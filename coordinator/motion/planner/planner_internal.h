@@ -13,6 +13,11 @@ static inline double max_of(double a, double b) {
     return a > b ? a : b;
 }
 
+// mm/s² that is asked for MOVE.
+static inline double planner_asked_accel(const struct planner *p, const struct planned_move *move) {
+    return move->ratio[AXIS_E] != 0 ? p->accel : p->travel_accel;
+}
+
 // Notes why a move is refused; returns -1.
 int planner_refuse(struct planner *p, int32_t kind, int32_t axis, double value, double low, double high);
 

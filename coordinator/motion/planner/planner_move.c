@@ -192,7 +192,7 @@ int planner_describe(struct planner *p, struct planned_move *move, const double 
         move->ratio[axis] = delta[axis] * scale;
     }
     move->length = length;
-    move->accel = p->accel;
+    move->accel = planner_asked_accel(p, move);
     move->cruise_v2 = p->limits.max_velocity * p->limits.max_velocity;
     if (speed < p->limits.max_velocity)
         move->cruise_v2 = speed * speed;

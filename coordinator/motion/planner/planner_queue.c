@@ -32,7 +32,7 @@ static void stand_still(struct planner *p) {
 void planner_init(struct planner *p, const struct planner_limits *limits, const double position[4]) {
     memset(p, 0, sizeof *p);
     p->limits = *limits;
-    p->accel = limits->max_accel;
+    p->accel = p->travel_accel = limits->max_accel;
     memcpy(p->position, position, sizeof p->position);
     p->plan_until = INFINITY;
     stand_still(p);
@@ -87,7 +87,7 @@ int planner_add(struct planner *p, const double target[4], double speed) {
     planner_note_slowed(p, move, speed);
     const struct planner_limits *l = &p->limits;
     double corner_v2 = l->square_corner_velocity * l->square_corner_velocity * (M_SQRT2 - 1);
-    move->corner_v2 = corner_v2 * (move->accel / p->accel);
+    move->corner_v2 = corner_v2 * (move->accel / planner_asked_accel(p, move));
     move->reach_v2 = 2 * move->accel * move->length;
     move->smooth_reach_v2 =
         move->extrude_only ? move->reach_v2 : move->reach_v2 * (1 - l->minimum_cruise_ratio);

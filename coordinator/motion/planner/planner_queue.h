@@ -92,7 +92,8 @@ struct planned_move {
 
 struct planner {
     struct planner_limits limits; // may change between moves; holds for moves added later
-    double accel;                 // mm/s² asked for, at most limits.max_accel
+    double accel;                 // mm/s² asked for moves with filament, at most limits.max_accel
+    double travel_accel;          // of moves without
     double position[4];           // mm, end of the last move added
     double pressure_advance;      // s; holds for the moves added later that print (E forward, X or Y moves)
     int64_t line;                 // of the program, noted with moves added later; 0: none

@@ -51,6 +51,14 @@ class Programs:
         self.on_remote: Callable[[str, Mapping[str, object]], None] | None = None
         """Calls one of these at those clients."""
 
+    def live_motion(self) -> tuple[Sequence[float], float, float] | None:
+        """Return where the head is now (X Y Z E, mm), and the speeds of head and filament, mm/s."""
+        motion = self._service.motion
+        if motion is None:
+            return None
+        moment = motion.moment()
+        return moment.position, moment.velocity_mm_s, moment.extruder_mm_s
+
     def begin(self, machine: "Machine") -> None:
         """Serve MACHINE, which has just been made ready."""
         machine.runner = self

@@ -180,9 +180,11 @@ class FileWork(Work):
         return Progress(lines, self.program.done_bytes, self.program.size_bytes)
 
     def close(self) -> None:
-        """Close the file; the modes of what follows are not this job's."""
+        """Close the file; the modes of what follows are not this job's, nor is its tower."""
         if self._job is not None:
             self._job.planner.reset_modes()
+            self._job.machine.tower = None
+            self._job.planner.watch_height(None)
         self.program.close()
 
 

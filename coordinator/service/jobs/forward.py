@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from coordinator.config.model import MachineDescription
+from coordinator.gcode.builtins import tuning
 from coordinator.gcode.builtins.state import present_state
 from coordinator.gcode.events import Emergency, End
 from coordinator.gcode.interpreter import Job
@@ -20,7 +21,15 @@ from coordinator.runtime.machine import Modules
 from coordinator.streaming.program_machine import machine_state
 from nodes.support.errors import CanductorError
 
-_DYNAMICS: Final = ("accel", "max_velocity", "square_corner_velocity", "minimum_cruise_ratio", "plane")
+_DYNAMICS: Final = (
+    "accel",
+    "travel_accel",
+    "axis_limits",
+    "max_velocity",
+    "square_corner_velocity",
+    "minimum_cruise_ratio",
+    "plane",
+)
 
 
 @dataclass(frozen=True)
@@ -84,10 +93,16 @@ def _variables(modules: "Modules") -> Mapping[str, Mapping[str, Any]]:
 
 
 def _extruder_lines(job: Job) -> list[str]:
-    active = job.machine.active
-    if active is None:
+    active, motion = job.machine.active, job.machine.filament
+    if active is None or motion is None:
         return []
+    tower = job.machine.tower
     return [
+        *([] if tower is None else [f"{tuning.NAME} {tower.written}"]),
+        *(
+            command_line("SET_EXTRUDER_ROTATION_DISTANCE", EXTRUDER=name, DISTANCE=distance_mm)
+            for name, distance_mm in motion.changed_mm.items()
+        ),
         command_line("ACTIVATE_EXTRUDER", EXTRUDER=active.name),
         command_line(
             "SET_PRESSURE_ADVANCE",

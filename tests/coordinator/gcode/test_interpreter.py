@@ -225,12 +225,15 @@ def test_the_state_of_the_language() -> None:
 
 def test_accelerations() -> None:
     _, t = run_lines(
-        "G28", "G1 X10 F6000", "M204 P3000", "G1 X20", "M204 T2000", "G1 X30", "M204 P1000", "G1 X40",
-        "M204 S5000", "G1 X50", "M204 P6000 T4000", "G1 X60",
-        "SET_VELOCITY_LIMIT ACCEL=700 VELOCITY=50", "G1 X70",
+        "G28", "M83", "G1 X10 F6000", "M204 P3000", "G1 X20", "G1 X30 E1", "M204 T2000", "G1 X40",
+        "G1 X50 E1", "M204 P1000", "G1 X60", "G1 X70 E1", "M204 S5000", "G1 X80", "G1 X90 E1",
+        "M204 P6000 T4000", "G1 X100", "M204 T60000", "G1 X110",
+        "SET_VELOCITY_LIMIT ACCEL=700 VELOCITY=50", "G1 X120 E1", "G1 X130",
+        "RESET_VELOCITY_LIMIT", "G1 X140",
     )  # fmt: skip
-    assert t["accel"].tolist() == [10000, 10000, 10000, 10000, 5000, 4000, 700]
-    assert t["cruise_v"][-1] == 50
+    print_and_travel = [10000, 3000, 2000, 3000, 2000, 1000, 5000, 5000, 4000]
+    assert t["accel"].tolist() == [10000, *print_and_travel, 10000, 700, 700, 10000]
+    assert t["cruise_v"][-2:].tolist() == [50, 100]
 
 
 def test_what_is_above_the_limits_is_cut_and_said() -> None:

@@ -101,6 +101,8 @@ def test_a_move_under_another_name_is_a_move() -> None:
         ("G4 P0 X1", "X of G4"),
         ("G92 E0 A1", "A of G92"),
         ("M204 S500 Q1", "Q of M204"),
+        ("M205 J0.02", "J of M205"),
+        ("M201 X500 S1", "S of M201"),
         ("SET_GCODE_OFFSET Z=0 FOO=1", "FOO of SET_GCODE_OFFSET"),
     ],
 )
@@ -138,16 +140,19 @@ def planner_after(*lines: str) -> Planner:
     return planner
 
 
-def test_limits_that_slicers_write_hold_up_to_the_configured_ones() -> None:
-    core = planner_after(
-        "M201 X500 Y100000000 Z20 E900", "M203 X90 Y100000000 Z4 E30", "M205 X3 Y2 Z1 E5"
-    )._core
+def test_limits_that_slicers_write_hold_up_to_the_configured_ones_until_the_next_program() -> None:
+    planner = planner_after("M201 X500 Y100000000 Z20 E900", "M203 X90 Y100000000 Z4 E30", "M205 X3 Y2 Z1 E5")
+    core = planner._core
     assert (core.limits.max_x_accel, core.limits.max_z_accel) == (500, min(20, LIMITS.max_z_accel))
     assert core.limits.max_y_accel == LIMITS.max_accel
     assert (core.limits.max_x_velocity, core.limits.max_y_velocity) == (90, LIMITS.max_velocity)
     assert core.limits.max_z_velocity == min(4, LIMITS.max_z_velocity)
     assert core.limits.max_extrude_only_velocity == min(30, LIMITS.max_extrude_only_velocity)
     assert core.limits.square_corner_velocity == min(2, LIMITS.square_corner_velocity)
+    planner.reset_modes()
+    fresh = Planner(LIMITS)._core.limits
+    for name in ("x_accel", "x_velocity", "z_accel", "z_velocity", "extrude_only_velocity"):
+        assert getattr(core.limits, f"max_{name}") == getattr(fresh, f"max_{name}")
 
 
 @pytest.mark.parametrize("line", ["M201 X0", "M203 Z-1", "M205 X0"])

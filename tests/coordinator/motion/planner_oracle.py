@@ -51,7 +51,8 @@ class Language:
         self.base = [0.0] * 4
         self.relative_e = False
         self.speed = 25.0
-        self.accel = limits.max_accel
+        self.accel = {"P": limits.max_accel, "T": limits.max_accel}
+        """Of moves with filament (P) and without (T)."""
         self.moves: list[Move] = []
 
     def line(self, line: str) -> None:
@@ -66,7 +67,8 @@ class Language:
         elif code in {"M82", "M83"}:
             self.relative_e = code == "M83"
         elif code == "M204":
-            self.accel = min(float(rest[1:]), self.limits.max_accel)
+            accel = min(float(rest[1:]), self.limits.max_accel)
+            self.accel |= dict.fromkeys("PT" if rest[0] == "S" else rest[0], accel)
 
     def move(self, words: dict[str, float]) -> None:
         target = list(self.at)
@@ -81,7 +83,8 @@ class Language:
 
     def limited(self, ratio: tuple[float, ...], length: float) -> Move:
         limits = self.limits
-        speed, accel = min(self.speed, limits.max_velocity), self.accel
+        asked = self.accel["P" if ratio[3] else "T"]
+        speed, accel = min(self.speed, limits.max_velocity), asked
         z, e = abs(ratio[2]), abs(ratio[3])
         if z:
             speed, accel = min(speed, limits.max_z_velocity / z), min(accel, limits.max_z_accel / z)
@@ -94,7 +97,7 @@ class Language:
             ratio,
             length,
             accel,
-            self.accel,
+            asked,
             speed,
             limits.square_corner_velocity,
             limits.minimum_cruise_ratio,

@@ -52,7 +52,7 @@ def read_dual_carriage(reading: Reading, frame: Frame, possible: Sequence[str]) 
     axis = "xyz".index(letter)
     first = frame.rails[axis]
     second = read_axis(reading, reader, letter, function)
-    dual = describe_dual(reader, axis, (first, first.steppers), (second, second.steppers))
+    dual = describe_dual(reader, axis, (first, first.steppers), (second, second.steppers), ("0", "1"))
     reading.finish(reader, waiting=WAITING if second.homing.waits else ())
     return park(frame, dual, second.steppers, reader.name)
 
@@ -83,13 +83,19 @@ def describe_dual(
     axis: int,
     first: tuple[RailDescription, tuple[StepperDescription, ...]],
     second: tuple[RailDescription, tuple[StepperDescription, ...]],
+    names: tuple[str, str],
 ) -> DualCarriageDescription:
-    """Return both carriages, each a rail and the steppers that move it; READER's section is the second's."""
+    """Return both carriages, each a rail and the steppers that move it; READER's section is the second's.
+
+    NAMES: as status reports call them.
+    """
     ranges = [axis_range(rail) for rail, _ in (first, second)]
     given = reader.find(SAFE_DISTANCE)
     usual = min(abs(ranges[0][0] - ranges[1][0]), abs(ranges[0][1] - ranges[1][1]))
-    one, two = (_carriage(rail, steppers) for rail, steppers in (first, second))
-    dual = DualCarriage(axis, (one, two), usual if given is None else given)
+    pairs = zip((first, second), names, strict=True)
+    one, two = (_carriage(rail, steppers, name) for (rail, steppers), name in pairs)
+    speed_mm_s = first[0].homing.speed
+    dual = DualCarriage(axis, (one, two), usual if given is None else given, speed_mm_s)
     if abs(one.home - two.home) < dual.safe_distance:
         raise reader.bad(
             SAFE_DISTANCE,
@@ -99,6 +105,7 @@ def describe_dual(
     return DualCarriageDescription((first[0], second[0]), dual)
 
 
-def _carriage(rail: RailDescription, steppers: tuple[StepperDescription, ...]) -> Carriage:
+def _carriage(rail: RailDescription, steppers: tuple[StepperDescription, ...], name: str) -> Carriage:
     low, high = axis_range(rail)
-    return Carriage(low, high, home_of(rail), tuple((stepper.name, stepper.weights) for stepper in steppers))
+    weights = tuple((stepper.name, stepper.weights) for stepper in steppers)
+    return Carriage(low, high, home_of(rail), weights, name)

@@ -69,6 +69,11 @@ class SumOption(Option[Sum]):
             terms[name] = value
         return tuple(terms.items())
 
+    def setting(self, text: str, value: Sum) -> object:
+        """Return the text."""
+        del value
+        return text
+
     def rule(self) -> str:
         """Return the values allowed."""
         return "a sum of different carriages as in carriage_x, x-y or carriage_x+0.5*carriage_y"
@@ -107,6 +112,11 @@ class _Carriages:
         section = {rail.axis: f"[carriage {name}]" for name, rail in self.first.items()}
         x, y, z = (f"position_min and position_max of {section[axis]}" for axis in "xyz")
         return (x, y, z)
+
+    def axes(self) -> dict[str, str]:
+        """Return the axis of each carriage by name."""
+        rails = {**self.first, **{name: rail for name, (rail, _) in self.second.items()}, **self.extra}
+        return {name: rail.axis for name, rail in rails.items()}
 
     def find(self, reader: SectionReader, option: Option[T], name: str) -> RailDescription:
         """Return a first or second carriage; raises ConfigError."""
@@ -225,7 +235,8 @@ def _frame(
     motors: list[_Motor],
 ) -> Frame:
     own = tuple(motor.stepper for motor in motors if not motor.second)
-    kinematics = GenericCartesian(tuple((s.name, s.weights[:3]) for s in own), box_of(*axes))
+    runs_on = tuple((name, "xyz".index(axis)) for name, axis in carriages.axes().items())
+    kinematics = GenericCartesian(tuple((s.name, s.weights[:3]) for s in own), box_of(*axes), runs_on)
     if not kinematics.independent:
         raise ConfigError(
             Place(reading.config.path, 0),
@@ -248,7 +259,11 @@ def _frame(
             raise ConfigError(
                 rail.place, f"no [stepper NAME] moves carriage '{name}'; name it in 'carriages' of one"
             )
-        dual = describe_dual(reader, axis, (frame.rails[axis], frame.rails[axis].steppers), (rail, theirs))
+        first = next(each for each, other in carriages.first.items() if other.axis == rail.axis)
+        names = (first, name)
+        dual = describe_dual(
+            reader, axis, (frame.rails[axis], frame.rails[axis].steppers), (rail, theirs), names
+        )
         reading.finish(reader, waiting=WAITING if rail.homing.waits else ())
         frame = park(frame, dual, theirs, reader.name)
     return frame

@@ -235,6 +235,40 @@ def test_an_extruder_stepper_has_the_advance_of_whom_it_follows() -> None:
     assert job.machine.extruders["extruder1"].pressure_advance_s == 0.02
 
 
+def test_the_carriages_go_back_to_where_they_were() -> None:
+    _, t, job = run(
+        "G28", "G1 X60 F6000", "SET_DUAL_CARRIAGE CARRIAGE=1", "G1 X180", "SET_DUAL_CARRIAGE CARRIAGE=0",
+        "SET_DUAL_CARRIAGE CARRIAGE=1 MODE=MIRROR", "SAVE_DUAL_CARRIAGE_STATE", "G1 X30",
+        "SET_DUAL_CARRIAGE CARRIAGE=1", "G1 X90", "SET_DUAL_CARRIAGE CARRIAGE=0", "G1 X50",
+        "RESTORE_DUAL_CARRIAGE_STATE MOVE_SPEED=30", "G1 X70 F6000",
+    )  # fmt: skip
+    # The second one makes room first: 60 mm would be too near to its 90 mm.
+    back = t[-3:]
+    assert back["start"][:, 0].tolist() == [90, 50, 60]
+    assert back["cruise_v"].tolist() == [30, 30, 100]
+    state = job.machine.carriage_state
+    assert state is not None
+    assert state.modes == job.machine.saved_carriages["default"].modes
+    assert state.at(70) == (70, 170)
+
+
+def test_another_way_per_turn_holds_from_a_standstill_on() -> None:
+    motion = ExtruderMotion(("extruder",), "extruder", {"extruder": "extruder"}, {"extruder": 22.5})
+    on = MachineState({"extruder": Extruder("extruder", LIMITS)}, motion)
+    events, _, _ = run(
+        "M83", "G1 E2", "SET_EXTRUDER_ROTATION_DISTANCE EXTRUDER=extruder",
+        "SET_EXTRUDER_ROTATION_DISTANCE EXTRUDER=extruder DISTANCE=-7.5", "G1 E2",
+        "SET_EXTRUDER_ROTATION_DISTANCE EXTRUDER=extruder DISTANCE=-7.5", on=on,
+    )  # fmt: skip
+    assert [event.weights for event in events if isinstance(event, WeightsChange)] == [
+        {"extruder": (0, 0, 0, -3)}
+    ]
+    assert [event.text for event in events if isinstance(event, Reply)] == [
+        "extruder: rotation_distance 22.500000 mm",
+        *["extruder: rotation_distance -7.500000 mm"] * 2,
+    ]
+
+
 @pytest.mark.parametrize(
     ("lines", "sentence"),
     [
@@ -244,7 +278,15 @@ def test_an_extruder_stepper_has_the_advance_of_whom_it_follows() -> None:
         ),
         (
             ["SAVE_DUAL_CARRIAGE_STATE", "RESTORE_DUAL_CARRIAGE_STATE"],
-            ":2: RESTORE_DUAL_CARRIAGE_STATE cannot move the carriages back; give MOVE=0",
+            ":2: RESTORE_DUAL_CARRIAGE_STATE comes before X is homed",
+        ),
+        (
+            ["G28", "SET_EXTRUDER_ROTATION_DISTANCE EXTRUDER=belted DISTANCE=0"],
+            ":2: DISTANCE of SET_EXTRUDER_ROTATION_DISTANCE is 0; 0.1 to 10000 mm are possible, with a minus",
+        ),
+        (
+            ["SET_EXTRUDER_ROTATION_DISTANCE EXTRUDER=nix"],
+            ":1: there is no extruder stepper 'nix'",
         ),
         (["G28", "G1 X211"], ":2: the move goes to X 211 mm, outside 0 to 200 mm"),
         (

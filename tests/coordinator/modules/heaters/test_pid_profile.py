@@ -37,7 +37,9 @@ def test_a_profile_is_loaded_and_left_again(tmp_path: Path) -> None:
             ("PID_PROFILE LOAD=fats HEATER=extruder", "has no profile 'fats'; did you mean fast"),
             ("PID_PROFILE LOAD=fast HEATER=heater_bed", "has no PID: its control is watermark"),
             ("PID_PROFILE HEATER=extruder", "needs one of LOAD, SAVE"),
-            ("PID_PROFILE REMOVE=fast HEATER=extruder", "removed by hand"),
+            ("PID_PROFILE REMOVE=fats HEATER=extruder", "there is no 'fats'"),
+            ("SET_HEATER_PID HEATER=extruder KP=1 KI=-1 KD=0", "SET_HEATER_PID must not be below 0"),
+            ("SET_HEATER_PID HEATER=heater_bed KP=1 KI=1 KD=0", "has no PID"),
             ("PID_PROFILE SET_VALUES=x HEATER=extruder KP=1 KI=1", "needs KD="),
             ("PID_PROFILE SAVE=default HEATER=extruder", "choose another name"),
         ):
@@ -54,6 +56,8 @@ def test_a_target_is_kept_without_a_jump_where_that_is_wanted(tmp_path: Path) ->
         await stage.do("M109 S120")
         await asyncio.sleep(60)
         before = stage.status("extruder")["power"]
+        await stage.do("SET_HEATER_PID HEATER=extruder KP=30 KI=2 KD=120")
+        assert (await stage.do("PID_PROFILE GET_VALUES=1 HEATER=extruder"))[0] == told("default", "30 2 120")
         await stage.do("PID_PROFILE LOAD=fast HEATER=extruder KEEP_TARGET=1")
         low, high = await stage.true_range(20)
         assert 119 < low <= high < 121
@@ -71,11 +75,16 @@ def test_a_profile_is_saved_and_there_at_the_next_start(tmp_path: Path) -> None:
         await stage.do("PID_PROFILE SET_VALUES=mine HEATER=extruder KP=25 KI=1.5 KD=99")
         await stage.do("PID_PROFILE SAVE=mine HEATER=extruder")
         assert any("profile mine of extruder was saved" in notice for notice in stage.notices)
+        await stage.do("PID_PROFILE SET_VALUES=gone HEATER=extruder KP=1 KI=1 KD=1")
+        await stage.do("PID_PROFILE SAVE=gone HEATER=extruder")
+        await stage.do("PID_PROFILE REMOVE=gone HEATER=extruder")
+        assert stage.notices[-1].startswith("profile gone of extruder was removed")
         await stage.do("SAVE_CONFIG")
 
     stage.connected(main)
     path = tmp_path / "printer.cfg"
     assert "\n#*# [pid_profile extruder mine]\n#*# control = pid\n#*# pid_kp = 25\n" in path.read_text()
+    assert "gone" not in path.read_text()
     (tmp_path / "again").mkdir()
     again = HeatMachine(tmp_path / "again", path.read_text().removeprefix(BASE))
 

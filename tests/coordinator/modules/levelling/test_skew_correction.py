@@ -69,6 +69,8 @@ def test_the_head_stays_where_it_is_and_is_called_by_another_place(tmp_path: Pat
     machine.run(restoring)
     assert machine.planner.toolhead_position == pytest.approx(place)
     machine.run("SKEW_PROFILE LOAD=other")
+    machine.run("SKEW_PROFILE REMOVE=other")
+    assert "there is no 'other'" in machine.error("SKEW_PROFILE LOAD=other")
     assert machine.modules.status()["skew_correction"] == {
         "current_profile_name": "other", "xy_skew": 0.01, "xz_skew": -0.002, "yz_skew": 0.003
     }  # fmt: skip
@@ -84,7 +86,7 @@ def test_the_head_stays_where_it_is_and_is_called_by_another_place(tmp_path: Pat
         ("SET_SKEW", "SET_SKEW has nothing to set"),
         ("SKEW_PROFILE LOAD=warm", "there is no 'warm'"),
         ("SKEW_PROFILE SAVE=a-b", "'a-b' cannot be a profile's name"),
-        ("SKEW_PROFILE", "SKEW_PROFILE takes LOAD=name or SAVE=name"),
+        ("SKEW_PROFILE", "SKEW_PROFILE takes one of LOAD=name, SAVE=name and REMOVE"),
     ],
 )
 def test_mistakes_are_told(tmp_path: Path, line: str, sentence: str) -> None:

@@ -100,6 +100,34 @@ def test_arcs_and_relative_moves_are_left_out_too(machine: ProgramStage) -> None
     assert at(machine) == (35, 60, 1, 1.5)  # 0.2, unretracted by 0.8, and 0.5
 
 
+def test_a_new_origin_within_an_excluded_object_counts(machine: ProgramStage) -> None:
+    lines = part("a", 100, 1.0)
+    machine.run(
+        *BEGIN, *DEFINED, "EXCLUDE_OBJECT NAME=a", *lines[:4], "G92 X0 E0", "G1 X7 Z1.2 E0.5",
+        "G1 E-0.3 F1800", lines[-1], "M114",
+    )  # fmt: skip
+    assert at(machine) == (5, 5, 1, 0.2), "drawn back by 0.8 it was, and is to be"
+    machine.run("G1 X20 Y60 F6000", "G1 E0.5 F1800")
+    assert at(machine) == pytest.approx((125, 60, 1.2, 1.0)), "X 105 was named 0; Z is the program's"
+
+
+def test_the_begin_of_an_object_ends_the_one_before(machine: ProgramStage) -> None:
+    said = machine.notices(
+        *BEGIN, *DEFINED, "EXCLUDE_OBJECT NAME=a", "EXCLUDE_OBJECT_START NAME=a", "G1 X50 E1.5",
+        "EXCLUDE_OBJECT_START NAME=b", "EXCLUDE_OBJECT_END NAME=a", "G1 X60 E2", "EXCLUDE_OBJECT_END NAME=b",
+        "EXCLUDE_OBJECT_END",
+    )  # fmt: skip
+    assert at(machine)[0] == 60
+    assert [line.partition(": ")[2] for line in said[-2:]] == [
+        "EXCLUDE_OBJECT_END A: it is B: the line is ignored",
+        "EXCLUDE_OBJECT_END: no object is being printed: the line is ignored",
+    ]
+    assert machine.run("EXCLUDE_OBJECT_DEFINE JSON=1")[0] == (
+        'Known objects: [{"name": "A", "center": [10.0, 20.0], "polygon": [[0.0, 0.0], [20.0, 0.0],'
+        ' [20.0, 40.0]]}, {"name": "B"}]'
+    )
+
+
 def test_taking_it_back_goes_on_with_the_object(machine: ProgramStage) -> None:
     lines = part("a", 100, 1.0)
     machine.run(

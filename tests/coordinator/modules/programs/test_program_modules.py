@@ -52,6 +52,13 @@ def test_retraction_can_be_forgotten(tmp_path: Path) -> None:
     assert at(machine) == before, "nothing is drawn back any more"
 
 
+def test_settings_of_retraction_go_back_to_the_configured_ones(tmp_path: Path) -> None:
+    machine = ProgramStage(tmp_path, RETRACTION)
+    machine.run("G28", "G1 Z1 F600", "G1 E5", "SET_RETRACTION RETRACT_LENGTH=2", "G10", "RESET_RETRACTION")
+    assert machine.modules.status()["firmware_retraction"]["retracted"] is True
+    assert machine.run("GET_RETRACTION")[0].startswith("RETRACT_LENGTH=0.8 ")
+
+
 def test_retraction_goes_by_no_mode(tmp_path: Path) -> None:
     machine = ProgramStage(tmp_path, RETRACTION)
     machine.run("G28", "G1 Z1 F600", "G91", "G20", "M82", "G10", "G1 X1", "G11")

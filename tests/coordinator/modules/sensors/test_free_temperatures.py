@@ -88,6 +88,23 @@ def test_a_host_that_is_too_hot_stops_the_machine(tmp_path: Path) -> None:
     stage.connected(main)
 
 
+def test_a_wait_for_a_temperature_can_be_ended(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, HOTEND_PID + BED)
+
+    async def main() -> None:
+        waits = asyncio.create_task(stage.do("TEMPERATURE_WAIT SENSOR=heater_bed MINIMUM=100"))
+        await asyncio.sleep(3)
+        assert not waits.done()
+        await stage.do("HEATER_INTERRUPT")
+        await asyncio.wait_for(waits, 2)
+        later = asyncio.create_task(stage.do("TEMPERATURE_WAIT SENSOR=heater_bed MINIMUM=100"))
+        await asyncio.sleep(3)
+        assert not later.done(), "it counts for the one that waits only"
+        later.cancel()
+
+    stage.connected(main)
+
+
 @pytest.mark.parametrize(("method", "expected"), [("min", 25), ("max", 41), ("mean", 33)])
 def test_several_sensors_become_one(tmp_path: Path, method: str, expected: float) -> None:
     stage = HeatMachine(tmp_path, HOTEND_PID + BED + BOTH.format(method=method), hurry=10)

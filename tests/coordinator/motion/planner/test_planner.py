@@ -178,13 +178,13 @@ G1 X10
     feed = planner.feed(text, feed.offset, len(text), final=True)
     assert feed == (FeedStatus.NEED_DATA, len(text), 9)
     t = joined(flushed(planner))
-    assert t["accel"].tolist() == [2000, 2000, 5000], "T alone has no effect"
+    assert t["accel"].tolist() == [2000, 1000, 5000], "T alone is for travel, as are these moves"
     assert t["start"][:, 0].tolist() == [0, 10, 20]
     assert planner.gcode_base == (20, 0, 0, 0)
     planner.set_accel_words({"P": 3000})
-    assert planner.accel == 5000
+    assert (planner.accel, planner.travel_accel) == (3000, 5000)
     planner.set_accel_words({"P": 3000, "T": 4000})
-    assert planner.accel == 3000
+    assert (planner.accel, planner.travel_accel) == (3000, 3000)
 
 
 @pytest.mark.parametrize(

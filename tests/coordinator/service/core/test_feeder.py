@@ -156,6 +156,15 @@ def test_moves_ignore_modes_and_modes_survive_no_job(feeder: Feeder) -> None:
     assert feeder.planner.accel == LIMITS.max_accel
 
 
+def test_a_tower_is_that_of_the_next_job_and_ends_with_it(feeder: Feeder) -> None:
+    feeder.submit(LinesWork(["TUNING_TOWER COMMAND=M118 PARAMETER=V START=1 FACTOR=1"]))
+    for count in (1, 0):
+        job = feeder.submit(file_of("G28", "M83", "G1 Z1 F600", "G1 X5 E1 F6000"))
+        drive(feeder)
+        assert [output.text for output in job.output][1:] == ["echo: V2.000000000"] * count
+    assert feeder.machine.tower is None
+
+
 def test_a_move_beyond_the_limits_says_so(feeder: Feeder) -> None:
     unhomed = feeder.submit(MoveWork({"X": 1.0}, 50.0, relative=True))
     drive(feeder)
