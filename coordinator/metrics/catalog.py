@@ -196,6 +196,8 @@ BUSES: Final = Group(
         Metric("frames_received", "bus_received_frames", "frames received", Kind.COUNTER),
         Metric("frames_malformed", "bus_malformed_frames", "received, and no sound frames", Kind.COUNTER),
         Metric("frames_dropped", "bus_dropped_frames", "that gave way: the host was slow", Kind.COUNTER),
+        Metric("bytes_sent", "bus_sent_bytes", "bytes sent, of a serial line", Kind.COUNTER),
+        Metric("bytes_received", "bus_received_bytes", "likewise received", Kind.COUNTER),
         Metric("send_waits", "bus_send_waits", "times the kernel took no more", Kind.COUNTER),
     ),
 )

@@ -415,7 +415,7 @@ def test_asking_for_what_a_section_that_exists_does_not_tell_ends_nothing(tmp_pa
     told = machine.run("ASK")
     assert told[:6] == [
         "[10.0, 20.5]|[5, 5]|[1.0, 2.0]",
-        "[[50, 25], [50, 225]]|PA0",
+        "[[50.0, 25.0], [50.0, 225.0]]|PA0",
         "[]|[[50.0, 17.0], [3.0, 1.0]]",
         "{}|[0.0, 0.0]",
         "False|[[0.0, 0.0, 0.0, 0.0]]",
