@@ -43,6 +43,23 @@ def test_nothing_changes_and_it_ends_with_a_poll_of_zero() -> None:
     assert host.run(1_000_000) == []
 
 
+def test_the_level_at_a_query_is_no_change_and_a_query_in_mid_count_begins_again() -> None:
+    host = Host()
+    host.configure("config_counter oid=3 pin=70 pull_up=1")
+    host.node.set_input(70, 1)
+    first, second = host.now + 1000, host.now + 20_000
+    said = []
+    for begin in (first, second):
+        host.send(f"query_counter oid=3 clock={begin} poll_ticks=1000 sample_ticks=50000")
+        said += host.run(begin + 500 - host.now)
+    said += host.run(60_000)
+    assert [args(answer) for answer in said] == [
+        (first + 50_000, 0, first),
+        (second + 50_000, 0, second),
+        (second + 100_000, 0, second),
+    ]
+
+
 def test_a_shutdown_ends_it() -> None:
     host, _ = counting()
     host.dies("emergency_stop")

@@ -47,6 +47,18 @@ def assign(node: SimNode) -> None:
     assert node.node_id == NODE_ID
 
 
+def test_boards_whose_uuids_differ_in_one_byte_alone_answer_apart() -> None:
+    def delay(last: int) -> int:
+        node = SimNode((UUID[:-1] + bytes([last])).hex(), 0)
+        node.receive_frame(ADMIN, QUERY)
+        ((found, _, _),) = answers(node, 2 * SPREAD)
+        return found
+
+    delays = [delay(last) for last in range(16)]
+    assert len(set(delays)) == 16
+    assert max(delays) - min(delays) > SPREAD // 2
+
+
 @pytest.mark.parametrize("query", [QUERY, WHO])
 def test_every_query_is_answered_once_after_a_time_drawn_anew(query: bytes) -> None:
     node = fresh(ROLLOVER - 20 * SPREAD)

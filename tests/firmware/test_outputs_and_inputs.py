@@ -231,6 +231,18 @@ def test_sums_are_gathered_into_reports() -> None:
     assert [a["next_clock"] for a in said] == [(begin + 10_000 * k) % ROLLOVER for k in (4, 8, 12)]
 
 
+def test_samples_of_a_sum_are_apart_by_the_time_asked_for() -> None:
+    host = analog()
+    begin = host.now + 1000
+    host.node.set_adc(50, 1)
+    host.send(QUERY.format(clock=begin, count=3, size=2, low=0, high=65535, checks=0))
+    for k, value in enumerate((10, 100)):  # the samples are at 0, 100 and 200 ticks
+        assert host.run(begin + 100 * k + 60 - host.now) == []
+        host.node.set_adc(50, value)
+    (answer,) = host.run(begin + 260 - host.now)
+    assert values(answer) == [111]
+
+
 def test_a_value_out_of_range_too_often_in_a_row_shuts_down() -> None:
     host = analog()
     begin = host.now + 1000
