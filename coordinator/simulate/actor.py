@@ -1,5 +1,6 @@
 """Carries out the faults of a scenario, in the true time of the world."""
 
+import random
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
@@ -9,6 +10,8 @@ from coordinator.simulate.faults import NS, ScenarioFault
 from coordinator.simulate.scenario import HOST
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.support.toml_values import ScenarioError
+from nodes.support._wire import ffi, lib
+from nodes.support.can_protocol import FIRST_DATA_ID
 from nodes.virtual.plant_page import PlantFault as State
 from nodes.virtual.plant_page import PlantItemKind
 from nodes.virtual.sim_plant import SimPlant
@@ -17,11 +20,20 @@ from nodes.virtual.world import CanController, CanPort, CanWire, Uart, UartPort
 FRAME_BITS: Final = 110
 """Bits of a typical frame: converts a ratio of frames to a ratio of bits."""
 BABBLE: Final = b"\xff" * 8
+FRAME_BYTES: Final = 8
+FLOOD_NS: Final = 2_000_000
+"""A flood of bytes is put on the line in portions of such a time."""
 
 
 def bit_errors(share: float) -> float:
     """Return the probability of a disturbed bit that disturbs SHARE of the frames."""
     return float(1.0 - (1.0 - share) ** (1.0 / FRAME_BITS))
+
+
+def _block(content: bytes, sequence: int) -> bytes:
+    out = ffi.new("uint8_t[64]")
+    ffi.memmove(out + lib.WIRE_HEADER, content, len(content))
+    return bytes(ffi.buffer(out, lib.wire_block_finish(out, len(content), sequence)))
 
 
 class SimActor:
@@ -50,6 +62,9 @@ class SimActor:
             "stall": self._stall,
             "babble": self._babble,
             "forge": self._forge,
+            "block": self._forge_block,
+            "lie": self._lie,
+            "flood": self._flood,
             "loss": self._rate,
             "corruption": self._rate,
             "errors": self._disturb,
@@ -118,6 +133,34 @@ class SimActor:
     def _forge(self, fault: ScenarioFault, begins: bool) -> None:
         if begins:
             self._controller(fault).send(fault.can_id, fault.data)
+
+    def _forge_block(self, fault: ScenarioFault, begins: bool) -> None:
+        sender = self._controller(fault)
+        if not begins:
+            return
+        nodeid = (fault.can_id - FIRST_DATA_ID) // 2
+        for board in self._boards.values():
+            if board.wire is self._board(fault).wire and board.node.expected[0] == nodeid:
+                block = _block(fault.data, board.node.expected[1])
+                for at in range(0, len(block), FRAME_BYTES):
+                    sender.send(fault.can_id, block[at : at + FRAME_BYTES])
+
+    def _lie(self, fault: ScenarioFault, begins: bool) -> None:
+        board = self._board(fault)
+        if begins:
+            board.node.lie(board.clock_hz, fault.wrong_s, fault.random_s)
+        else:
+            board.node.lie(board.clock_hz, 0.0)
+
+    def _flood(self, fault: ScenarioFault, begins: bool) -> None:
+        wire = self._wires[fault.bus]
+        if not begins or not isinstance(wire, Uart):
+            return
+        dice = random.Random(fault.begin_ns)  # noqa: S311 (a simulation)
+        count = round(fault.share * wire.baud / 10 * FLOOD_NS / NS)
+        for at_ns in range(fault.begin_ns + FLOOD_NS, fault.end_ns, FLOOD_NS):
+            data = (fault.data * count)[:count] if fault.data else dice.randbytes(count)
+            self._world.at(at_ns, partial(wire.inject, data))
 
     def _babble(self, fault: ScenarioFault, begins: bool) -> None:
         controller = self._controller(fault)

@@ -10,7 +10,7 @@ from coordinator.support.toml_values import Dice
 NS: Final = 1_000_000_000
 SILENCE_S: Final = 1.5
 """Maximum time from the last good frame to a stop that only a bad wire can have caused."""
-ISOLATING: Final = ("cut", "power", "stall", "babble", "errors", "loss")
+ISOLATING: Final = ("cut", "power", "stall", "babble", "errors", "loss", "flood")
 """Faults that may keep a stop from reaching a node."""
 
 
@@ -26,6 +26,8 @@ class ScenarioFault:
     share: float
     can_id: int
     data: bytes = b""
+    wrong_s: float = 0.0
+    random_s: float = 0.0
 
 
 class Actor(Protocol):
@@ -80,7 +82,10 @@ class Faults:
             end_ns = begin_ns + duration_ns
             node, bus = setting.node, setting.bus
             share, data = draw("share"), bytes.fromhex(setting.data)
-            faults.append(ScenarioFault(setting.kind, node, bus, begin_ns, end_ns, share, setting.id, data))
+            wrong = (draw("wrong_s"), draw("random_s"))
+            faults.append(
+                ScenarioFault(setting.kind, node, bus, begin_ns, end_ns, share, setting.id, data, *wrong)
+            )
         return faults
 
     # ------------------------------------------------------------------------------------------ afterwards

@@ -104,12 +104,16 @@ FAULT_KINDS: Final = {
     "stall": "the node, or the host, does nothing",
     "babble": "the node sends frames without end",
     "forge": "the node's controller sends one frame with the id and the content of others",
+    "block": "the node's controller sends a sound block with the number that the receiver expects",
+    "lie": "the node answers by a clock that is wrong; its timers stay right",
+    "flood": "foreign bytes are on the UART in both directions, among what is sent",
     "loss": "a share of the bus's frames vanishes",
     "corruption": "a share of the bus's frames changes without anybody noticing",
     "errors": "a share of the bus's frames becomes error frames; all of them: who sends goes bus-off",
     "interrupt": "the user presses Ctrl-C",
     "sensor": "the wires of the node's temperature sensors are open; the scenario needs a plant",
 }
+_OF_A_NODE: Final = frozenset(FAULT_KINDS) - {"loss", "corruption", "errors", "interrupt", "flood"}
 HOST: Final = "host"
 
 
@@ -132,9 +136,14 @@ class FaultSetting:
     share: Range = option(span(0, 1), Range(0, 0))
     """How much of the bus's frames; afterwards there are no such faults on it, whatever its setting says."""
     id: int = option(whole(0, 0x7FF), 0x700)
-    """``babble``, ``forge``: the CAN id that is sent."""
+    """``babble``, ``forge``, ``block``: the CAN id that is sent."""
     data: str = option(text, "")
-    """``forge``: the frame's content, at most 8 bytes as hexadecimal digits."""
+    """``forge``: the frame's content; ``block``: the commands in it; ``flood``: what is repeated, or nothing for
+    random bytes. At most 8 bytes as hexadecimal digits."""
+    wrong_s: Range = option(span(-100, 100, "s"), Range(0, 0))
+    """``lie``: how far the clock it answers with is from its own."""
+    random_s: Range = option(span(0, 100, "s"), Range(0, 0))
+    """``lie``: up to so much more, other in every answer."""
     times: Range = option(span(1, 50), Range(1, 1))
     """How often it happens."""
     every_s: Range = option(span(0.01, 60, "s"), Range(1, 1))
@@ -308,7 +317,7 @@ def _faults(entries: object, where: str) -> tuple[FaultSetting, ...]:
         raise ScenarioError(f"{where}: {len(entries)} faults; {MAX_FAULTS} is the most")
     faults = [read(FaultSetting, e, f"{where}: [[faults]] number {i}") for i, e in enumerate(entries, 1)]
     for number_, fault in enumerate(faults, 1):
-        on_bus = fault.kind in ("loss", "corruption", "errors")
+        on_bus = fault.kind in ("loss", "corruption", "errors", "flood")
         if not _is_content(fault.data):
             raise ScenarioError(
                 f"{where}: [[faults]] number {number_}: data must be 0..8 bytes in hexadecimal, "
@@ -325,7 +334,7 @@ def _is_content(text_: str) -> bool:
 
 
 def _needs_node(fault: FaultSetting) -> bool:
-    return not fault.node and fault.kind in ("cut", "reset", "power", "stall", "babble", "forge", "sensor")
+    return not fault.node and fault.kind in _OF_A_NODE
 
 
 # ---------------------------------------------------------------------------------------------- finding

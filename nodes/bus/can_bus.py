@@ -19,13 +19,22 @@ from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeError, NodeLost
 from nodes.node.node import Node, OnClock, OnState
 from nodes.node.states import NodeState
-from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, BUS_OFF, BUS_STOP_ID, QUERY_UNASSIGNED
+from nodes.support.can_protocol import (
+    ADMIN_ID,
+    ADMIN_RESPONSE_ID,
+    BUS_OFF,
+    BUS_STOP_ID,
+    FIRST_DATA_ID,
+    QUERY_UNASSIGNED,
+)
 from nodes.support.errors import CanductorError
 
 SUSPECT_INTERVAL_S: Final = 0.1
 """Least interval between queries for nodes that wait for an id."""
 BUS_STOP_FRAMES: Final = 3
 """Repeats of the stop frame: it is not acknowledged, and a bus that must be stopped may lose frames."""
+
+_IN_USE: Final = (NodeState.IDENTIFYING, NodeState.CONFIGURING, NodeState.READY)
 
 
 class CanBus(BusBase):
@@ -42,6 +51,7 @@ class CanBus(BusBase):
         super().__init__(name, start_io, cache=cache, on_notice=on_notice)
         self._nodeids: dict[Uuid, int] = {}
         self._by_uuid: dict[Uuid, Node] = {}
+        self._to_nodes: dict[int, Node] = {}
         self._connectors: list[_CanConnector] = []
         self._assigning = asyncio.Lock()
         self._assignment: IdAssignment | None = None
@@ -74,6 +84,9 @@ class CanBus(BusBase):
             cache=self._cache,
         )
         self._by_uuid[uuid] = node
+        self._to_nodes = {
+            FIRST_DATA_ID + 2 * self._nodeids[uuid]: node for uuid, node in self._by_uuid.items()
+        }
         return self._add(node, may_be_absent=may_be_absent)
 
     async def close(self) -> None:
@@ -179,12 +192,29 @@ class CanBus(BusBase):
             self._doubt(waiting_uuid(frame.data))
         elif frame.can_id == BUS_OFF:
             self._went_bus_off()
+        elif frame.can_id in self._to_nodes:
+            self._has_another_host(self._to_nodes[frame.can_id], frame.can_id)
 
     def _bus_stopped(self, reason: int, nodeid: int) -> None:
         """Record that a node stopped the bus: later reports of the other nodes are consequences."""
         for uuid, node in self._by_uuid.items():
             if self._nodeids[uuid] == nodeid:
                 node.stopped_the_bus(reason)
+
+    def _has_another_host(self, node: Node, can_id: int) -> None:
+        """Stop and lose NODE, because a frame to it was received, and a host does not receive its own frames.
+
+        The node counts a block of that host as one of ours, and takes our next one for a repeat: commands go
+        missing, and nothing but this frame shows it. So may the stop; the bus-wide stop that follows has no
+        number. A node without it carries out what it has (up to the lead) and stops then.
+        """
+        if not node.talks or node.state not in _IN_USE:
+            return
+        node.emergency_stop()
+        node.lose(
+            f"another host sends to it, with id 0x{can_id:03X} on bus {self.name}, so that commands go"
+            " missing; let only one host drive a node, and look for a second one, or a program, on this bus"
+        )
 
     def _went_bus_off(self) -> None:
         cause = (

@@ -18,6 +18,9 @@ struct sim_board {
     uint64_t edges_lost;
     struct node_config config; // but for clock_high, which every start sets anew
     uint8_t on_can, reset_wanted;
+    uint8_t talks; // it runs tasks or takes a frame: what it reads of its clock may be wrong
+    int64_t lie;   // ticks
+    uint32_t lie_spread, lie_chance;
     struct sim_owner owner; // all null: none
     uint8_t out[SIM_OUT_ROOM];
     size_t out_size;
@@ -194,8 +197,27 @@ uint64_t sim_clock(const struct sim_board *board) {
     return board->clock;
 }
 
+uint32_t sim_expected(const struct sim_board *board) {
+    return board->virtual.node.rx.expected;
+}
+
+void sim_lie(struct sim_board *board, int64_t offset, uint32_t spread) {
+    board->lie = offset;
+    board->lie_spread = spread;
+    board->lie_chance = 1;
+}
+
 uint32_t board_clock(struct node *node) {
-    return (uint32_t)((struct sim_board *)node)->clock;
+    struct sim_board *board = (struct sim_board *)node;
+    uint32_t clock = (uint32_t)board->clock;
+    if (!board->talks)
+        return clock;
+    clock += (uint32_t)board->lie;
+    if (board->lie_spread) {
+        board->lie_chance = board->lie_chance * 1664525 + 1013904223;
+        clock += (uint32_t)((uint64_t)board->lie_chance * board->lie_spread >> 32);
+    }
+    return clock;
 }
 
 uint64_t virtual_clock(struct virtual_board *virtual) {
@@ -244,7 +266,9 @@ int sim_reset_wanted(const struct sim_board *board) {
 }
 
 void sim_run_tasks(struct sim_board *board) {
+    board->talks = 1;
     node_run_tasks(&board->virtual.node);
+    board->talks = 0;
     virtual_irq_check(&board->virtual);
 }
 
@@ -268,7 +292,9 @@ void sim_power_on(struct sim_board *board, uint64_t start_clock) {
 void sim_receive_frame(struct sim_board *board, uint32_t id, const uint8_t *data, size_t size) {
     if (!board->on_can)
         return;
+    board->talks = 1;
     can_stream_receive(&board->virtual.node, id, data, size);
+    board->talks = 0;
     run_tasks(board);
 }
 

@@ -78,6 +78,13 @@ struct sim_counters {
 };
 void sim_counters(const struct sim_board *board, struct sim_counters *out);
 
+uint32_t sim_node_id(const struct sim_board *board);
+// The sequence number (0..15) of the block that it would accept next.
+uint32_t sim_expected(const struct sim_board *board);
+// From now on what it sends and does in tasks and on frames is by a clock that is wrong by OFFSET ticks and
+// up to SPREAD more, at random; its timers stay right. 0, 0: the truth again.
+void sim_lie(struct sim_board *board, int64_t offset, uint32_t spread);
+
 // The dictionary of the build, zlib-compressed, and its SIZE.
 const uint8_t *sim_dictionary(uint32_t *size);
 // cffi: end
@@ -99,7 +106,6 @@ struct sim_owner {
 };
 // OWNER is copied.
 void sim_own(struct sim_board *board, const struct sim_owner *owner);
-uint32_t sim_node_id(const struct sim_board *board);
 int sim_tasks_wanted(const struct sim_board *board);
 int sim_reset_wanted(const struct sim_board *board);
 void sim_run_tasks(struct sim_board *board);

@@ -122,6 +122,11 @@ class Uart:
         """Change the probabilities that a byte is lost, or has a wrong bit."""
         _set_faults(lib.world_uart_settings(self.raw), loss, corruption)
 
+    def inject(self, data: bytes) -> None:
+        """Put DATA on the line in both directions, among what is sent; what has no room is lost."""
+        for to_node in (0, 1):
+            lib.world_uart_inject(self.raw, to_node, data, len(data))
+
     def counters(self) -> dict[str, int]:
         """Return the counters of the line."""
         return counters(lib.world_uart_counters(self.raw))

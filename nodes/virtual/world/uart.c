@@ -109,6 +109,10 @@ size_t uart_to_host(struct world_uart *uart, const uint8_t *data, size_t size) {
     return way_put(&uart->to_host, data, size);
 }
 
+size_t world_uart_inject(struct world_uart *uart, int to_node, const uint8_t *data, size_t size) {
+    return to_node ? uart_to_node(uart, data, size) : uart_to_host(uart, data, size);
+}
+
 void uart_clear_to_host(struct world_uart *uart) {
     uart->to_host.queue.count = 0;
     agenda_cancel(&uart->world->agenda, &uart->to_host.byte);

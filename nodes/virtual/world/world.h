@@ -79,6 +79,8 @@ struct world_uart_counters {
 };
 struct world_uart *world_add_uart(struct world *world, const struct world_uart_settings *settings);
 struct world_uart_settings *world_uart_settings(struct world_uart *uart);
+// Puts foreign bytes on the line, in the order of what is sent; returns how many had room.
+size_t world_uart_inject(struct world_uart *uart, int to_node, const uint8_t *data, size_t size);
 const struct world_uart_counters *world_uart_counters(const struct world_uart *uart);
 
 // ------------------------------------------------------------------------------------------------- nodes

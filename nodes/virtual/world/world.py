@@ -252,6 +252,20 @@ class WorldNode:
                 f"node {self.uuid}: its clock's rate was changed {lib.WORLD_RATES_MAX} times already"
             )
 
+    def lie(self, clock_hz: int, offset_s: float, spread_s: float = 0.0) -> None:
+        """From now on it answers by a clock (CLOCK_HZ) wrong by OFFSET_S, up to SPREAD_S more at random.
+
+        Its timers, and so the steps that it was sent already, stay right.
+        """
+        board = lib.world_node_board(self.raw)
+        lib.sim_lie(board, round(offset_s * clock_hz), round(spread_s * clock_hz))
+
+    @property
+    def expected(self) -> tuple[int, int]:
+        """Its node id, and the sequence number of the block that it would accept next."""
+        board = lib.world_node_board(self.raw)
+        return int(lib.sim_node_id(board)), int(lib.sim_expected(board))
+
     def set_input(self, pin: int, level: int, at_ns: int = 0) -> None:
         """Set the input PIN at AT_NS (or now); it persists over resets."""
         self._plan(lib.world_node_set_input(self.raw, pin, level, at_ns), pin)
