@@ -138,8 +138,8 @@ class FaultSetting:
     id: int = option(whole(0, 0x7FF), 0x700)
     """``babble``, ``forge``, ``block``: the CAN id that is sent."""
     data: str = option(text, "")
-    """``forge``: the frame's content; ``block``: the commands in it; ``flood``: what is repeated, or nothing for
-    random bytes. At most 8 bytes as hexadecimal digits."""
+    """``forge``: the frame's content; ``block``: the commands in it; ``flood``: what is repeated, or nothing
+    for random bytes. At most 8 bytes as hexadecimal digits."""
     wrong_s: Range = option(span(-100, 100, "s"), Range(0, 0))
     """``lie``: how far the clock it answers with is from its own."""
     random_s: Range = option(span(0, 100, "s"), Range(0, 0))
