@@ -206,9 +206,12 @@ def test_power_goes_stale_after_its_time_and_not_at_it(chamber: Driven) -> None:
     unit._end_stale_heat()
     assert unit.power == 0.0
     assert [share for _, share in chamber.sent] == [0.123456, 0.0]
-    live.host_s += 10.0
-    unit._end_stale_heat()
+    waiting = len(live.later)
+    for later_s in (0.0, 10.0):  # off it stays, and nothing looks at it any more
+        live.host_s += later_s
+        unit._end_stale_heat()
     assert len(chamber.sent) == 2
+    assert len(live.later) == waiting
 
 
 def test_how_long_power_lasts_follows_from_max_duration(tmp_path: Path) -> None:
