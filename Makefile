@@ -8,10 +8,13 @@ NATIVE_INPUTS := $(C_SOURCES) $(wildcard firmware/Makefile firmware/tools/*.py) 
 
 C_WARNINGS := -std=gnu11 -Wall -Wextra -Wconversion -Wno-psabi -Werror -I. -Ifirmware
 
-.PHONY: demo test check pytest ctest fuzz vcan bench clean setup format
+.PHONY: demo test check pytest ctest fuzz vcan bench clean setup format pytest-live pytest-sim pytest-coordinator \
+	pytest-motion pytest-others
 .DEFAULT_GOAL := test
 
-setup: $(VENV)/.installed
+# The C code is compiled while pip fetches packages.
+setup:
+	@$(MAKE) -j2 --no-print-directory $(VENV)/.installed
 
 $(VENV)/.python: pyproject.toml .ci/prerequisites
 	@sh .ci/prerequisites $(PYTHON)
@@ -28,9 +31,7 @@ $(VENV)/.compiled: $(VENV)/.python $(NATIVE_INPUTS)
 	$(BIN)/python setup.py -q build_ext --inplace
 	@touch $@
 
-# The C code is compiled while pip fetches packages.
-$(VENV)/.installed: $(VENV)/.python .ci/requirements $(NATIVE_INPUTS)
-	@$(MAKE) -j2 --no-print-directory $(VENV)/.dependencies $(VENV)/.compiled
+$(VENV)/.installed: $(VENV)/.dependencies $(VENV)/.compiled
 	$(BIN)/pip install -q --disable-pip-version-check --no-build-isolation --no-deps -e .
 	# As an installation that is not editable does; some environments forbid Python to do it later.
 	@$(BIN)/python -m compileall -q coordinator nodes canbus_tools
@@ -39,7 +40,7 @@ $(VENV)/.installed: $(VENV)/.python .ci/requirements $(NATIVE_INPUTS)
 demo: setup
 	$(BIN)/canductor demo
 
-check: setup
+check: $(VENV)/.dependencies
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -50,19 +51,31 @@ check: setup
 	@$(MAKE) --no-print-directory clang-c
 	@! command -v node >/dev/null || for f in coordinator/web/page/*.js; do \
 	  node --check --input-type=module <$$f || exit 1; done
-	$(BIN)/pytest tests/test_import_floors.py
+	$(BIN)/pytest --noconftest tests/test_import_floors.py
 
-ctest: setup
+ctest: $(VENV)/.installed
 	$(MAKE) -C tests PYTHON=$(abspath $(BIN)/python)
 	$(MAKE) -C tests/fuzz short
 
-# A file's tests run in one process, in order: what they share is set up once.
-pytest: setup
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+# The Python tests in parts of about equal size, which run in parallel: a process collects its own part only.
+LIVE := tests/smoke tests/coordinator/web
+MOTION := tests/coordinator/motion tests/coordinator/kinematics tests/coordinator/verification
+pytest-live: WHAT = $(LIVE)
+pytest-sim: WHAT = tests/sim
+pytest-coordinator: WHAT = tests/coordinator $(addprefix --ignore=,$(LIVE) $(MOTION))
+pytest-motion: WHAT = $(MOTION)
+# The import floors are part of check.
+pytest-others: WHAT = tests $(addprefix --ignore=,$(LIVE) tests/sim tests/coordinator tests/test_import_floors.py)
+PARTS := pytest-live pytest-sim pytest-coordinator pytest-others pytest-motion
+$(PARTS): $(VENV)/.installed
+	$(BIN)/pytest $(WHAT)
 
-# All of it side by side. Nothing but a dozen smoke tests takes real time (docs/testing.md).
-test: setup
-	$(MAKE) -j2 --output-sync=target pytest check ctest
+pytest:
+	@$(MAKE) -k -j3 --output-sync=target $(PARTS)
+
+# All of it in parallel. Nothing but a dozen smoke tests takes real time (docs/testing.md).
+test:
+	@$(MAKE) -k -j3 --output-sync=target check $(PARTS) ctest
 
 # Ten minutes of hostile G-code through the motion engine, under the sanitizers; ctest has a short run of it.
 FUZZ_SECONDS ?= 600
