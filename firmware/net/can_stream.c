@@ -73,7 +73,6 @@ void can_stream_receive(struct node *node, uint32_t id, const uint8_t *data, siz
     } else if (id == CAN_ID_TABLES) {
         table_receive_frame(node, data, size);
     } else if (stream->node_id && id == receive_id(stream)) {
-        stream->frames_in++;
         node_receive(node, data, size);
     } else if (stream->node_id && id == transmit_id(stream)) {
         lose_id(node);
@@ -94,7 +93,6 @@ void can_stream_task(struct node *node) {
     while ((size = node_transmit_peek(node, data, sizeof(data)))) {
         if (stream->node_id && board_can_send(node, transmit_id(stream), data, size))
             return;
-        stream->frames_out += stream->node_id != 0;
         node_transmitted(node, size);
     }
 }

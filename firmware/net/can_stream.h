@@ -18,7 +18,6 @@ enum { CAN_ID_URGENT_END = 0x100 };
 // One per node, owned by the board; zeroed by can_stream_attach().
 struct can_stream {
     uint8_t node_id; // 0: none assigned
-    uint32_t frames_in, frames_out;
     struct discovery discovery;
     struct bus_signals signals;
 };

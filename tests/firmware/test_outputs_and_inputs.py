@@ -332,6 +332,7 @@ def test_the_event_buffer_is_bounded_and_keeps_the_last_state() -> None:
         ),
         ("buttons_add oid=2 pos=3 pin=60 pull_up=1", "Set button past maximum button count"),
         ("buttons_add oid=2 pos=1 pin=4660 pull_up=1", "Not a valid input pin"),
+        ("buttons_add oid=2 pos=1 pin=144 pull_up=1", "Not a valid input pin"),
     ],
 )
 def test_senseless_button_commands_shut_down(command: str, text: str) -> None:

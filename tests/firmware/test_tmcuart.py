@@ -89,11 +89,13 @@ def test_limits_are_the_nodes_own() -> None:
         host = Host()
         host.send("allocate_oids count=2")
         assert host.dies(f"config_tmcuart oid=0 {pins} bit_time=400") == "Not a valid tmcuart pin"
-    for bit_time in (7, 1 << 21):
+    for bit_time in (7, (1 << 20) + 1):
         host = Host()
         host.send("allocate_oids count=2")
         text = f"config_tmcuart oid=0 rx_pin=3 pull_up=0 tx_pin=3 bit_time={bit_time}"
         assert host.dies(text) == "Invalid tmcuart bit time"
+    for bit_time in (8, 1 << 20):
+        Host().configure(f"config_tmcuart oid=0 rx_pin=3 pull_up=0 tx_pin=3 bit_time={bit_time}")
 
 
 def test_a_shutdown_ends_it_with_the_line_idle() -> None:

@@ -121,6 +121,7 @@ const struct node_tables node_tables = {
 };
 
 void sched_report_shutdown_task(struct node *node);
+void command_task(struct node *node);
 void command_allocate_oids(struct node *node, const struct wire_arg *args);
 void command_finalize_config(struct node *node, const struct wire_arg *args);
 void command_config_reset(struct node *node, const struct wire_arg *args);
@@ -488,6 +489,16 @@ static void a_configuration_is_reset_with_its_outputs_at_their_defaults(void) {
     CHECK(!node.shutdown.active);
 }
 
+// The tables have no command at all: the first id is behind the last one.
+static void an_id_behind_the_last_command_is_invalid(void) {
+    uint8_t block[WIRE_BLOCK_MAX] = {0};
+    start(0);
+    node_receive(&node, block, wire_block_finish(block, wire_vlq_encode(block + WIRE_HEADER, 0), 0));
+    command_task(&node);
+    CHECK(node.shutdown.active);
+    CHECK_EQUAL(node.shutdown.reason, string_invalid_command);
+}
+
 int main(void) {
     a_start_leaves_nothing_of_before();
     tasks_run_in_rounds_until_none_is_wanted();
@@ -504,6 +515,7 @@ int main(void) {
     objects_are_found_by_number_and_type();
     moves_are_as_many_as_configured_and_go_round();
     a_configuration_is_reset_with_its_outputs_at_their_defaults();
+    an_id_behind_the_last_command_is_invalid();
     CHECK_EQUAL(resets, 0);
     return 0;
 }

@@ -26,6 +26,7 @@ def test_known_time_is_taken_off_both_ends() -> None:
 
 def test_an_exchange_faster_than_the_wire_is_left_alone() -> None:
     assert narrow(1_000_000, 1_300_000, 111_000, 222_000) == (1_000_000, 1_300_000)
+    assert narrow(1_000_000, 1_333_000, 111_000, 222_000) == (1_111_000, 1_111_000), "as fast as the wire"
 
 
 def test_an_unknown_time_of_sending_stays_unknown() -> None:

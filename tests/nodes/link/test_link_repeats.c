@@ -165,24 +165,27 @@ static void whatever_waits_has_a_deadline(void) {
 
 // A repeat whose commands are due within 200 ms goes twice; the blocks behind it do not.
 static void what_is_due_soon_is_repeated_twice(void) {
-    for (unsigned left_ms = 199; left_ms <= 240; left_ms += 41) {
+    static const uint64_t left_ns[] = {200 * MS, 200 * MS - 1, 1, 0};
+    for (size_t i = 0; i < sizeof left_ns / sizeof *left_ns; i++) {
+        const int soon = left_ns[i] && left_ns[i] < 200 * MS;
         struct scene scene;
         open_timed(&scene);
-        motion(&scene, 'm', 59, 0, TICKS + left_ms);
-        motion(&scene, 'n', 3, 0, TICKS + left_ms);
+        const uint64_t due_ns = scene.now + 240 * MS;
+        motion(&scene, 'm', 59, 0, TICKS + 240);
+        motion(&scene, 'n', 3, 0, TICKS + 240);
         CHECK_EQUAL(go(&scene), 64); // the first transmission is one
         check_goes(&scene, "nnn");
         uint64_t outstanding = scene.link.naks_outstanding;
-        time_passes(&scene, deadline_of(&scene));
+        time_passes(&scene, due_ns - left_ns[i]);
         char content[WIRE_CONTENT_MAX + 1] = {0};
         memset(content, 'm', WIRE_CONTENT_MAX);
         size_t size = go(&scene);
-        if (left_ms < 200)
+        if (soon)
             check_twice(&scene, size, 2, content); // 66 bytes: the gap is no whole frame
         else
             check_block(&scene, size, 1, content);
         check_goes(&scene, "nnn");
-        CHECK_EQUAL(scene.link.naks_outstanding, outstanding + 2 + (left_ms < 200));
+        CHECK_EQUAL(scene.link.naks_outstanding, outstanding + 2 + (uint64_t)soon);
         CHECK_EQUAL(scene.link.in_flight_bytes, size + 8);
         acknowledge_all(&scene);
         CHECK_EQUAL(scene.link.in_flight_bytes, 0);
