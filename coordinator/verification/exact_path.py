@@ -289,8 +289,11 @@ def _turns(path: StepperPath, begin: Floats, end: Floats) -> Floats:
     share = np.linspace(1e-6, 1 - 1e-6, SAMPLES)
     at = begin[:, None] + (end - begin)[:, None] * share
     slope = path.slope(at.reshape(-1)).reshape(at.shape)
-    row, column = np.nonzero(slope[:, :-1] * slope[:, 1:] < 0)
-    low, high, sign = at[row, column], at[row, column + 1], np.sign(slope[row, column])
+    signs = np.sign(slope)
+    for i in range(1, SAMPLES):  # a sample may hit the turn: in a symmetric piece the middle one does
+        signs[:, i] = np.where(signs[:, i] == 0, signs[:, i - 1], signs[:, i])
+    row, column = np.nonzero(signs[:, :-1] * signs[:, 1:] < 0)
+    low, high, sign = at[row, column], at[row, column + 1], signs[row, column]
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         before = path.slope(middle) * sign > 0

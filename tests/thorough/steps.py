@@ -49,6 +49,13 @@ def steps(amount: Amount) -> Iterator[Step]:
         (*pytest, "--hypothesis-profile", "full", "--timeout", "1800"),
         _PYTEST_FIGURE,
     )
+    ties = "tests/coordinator/motion/test_half_step_ties.py"
+    yield Step(
+        "ties",
+        "10,000 programs that rest and turn at half steps",
+        (python, "-m", "pytest", "-q", "--hypothesis-profile", "full", "--timeout", "1800", ties),
+        _PYTEST_FIGURE,
+    )
     yield Step(
         "sim",
         "machines in virtual time, each seed with other faults",

@@ -17,6 +17,7 @@ def test_the_steps_are_those_of_the_manual() -> None:
     names = [entry.name for entry in steps(Amount())]
     assert names == [
         "full",
+        "ties",
         "sim",
         "loss-5",
         "loss-10",

@@ -128,3 +128,8 @@ def check(of: Program) -> int:
 def test_no_step_is_made_that_the_motion_does_not_need(part: int) -> None:
     pairs = sum(check(program(seed)) for seed in range(part, PROGRAMS, 4))
     assert pairs > PROGRAMS / 4
+
+
+def test_a_turn_in_the_very_middle_of_a_piece_is_a_turn() -> None:
+    """Pressure advance that begins as it ends: the slope is exactly 0 where its middle is sampled."""
+    assert check(program(7099)) > 0
