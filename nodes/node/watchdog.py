@@ -29,23 +29,21 @@ class NodeWatchdog:
         self._crc = crc
         self._uptime_ticks = 0
 
-    async def look(self) -> NodeError | None:
-        """Return the failure of the node, or None. Raises QueryTimeout and what RequestReply.ask raises.
+    async def look(self, uptime: Message, config: Message) -> NodeError | None:
+        """Return the failure of the node, or None, by its answers to get_uptime and get_config.
 
         After a restart the configuration is gone and the uptime has run backwards. The uptime shows a restart
         even when another host has meanwhile configured the node identically.
         """
         name = self._talk.name
-        found = await get_config(self._talk, tries=1)
-        if not found.integer("is_config"):
+        if not config.integer("is_config"):
             return restarted(name, "its configuration is gone")
-        if found.integer("crc") != self._crc:
+        if config.integer("crc") != self._crc:
             return NodeRestarted(f"node {name} was given another configuration; let only one host drive it")
-        if found.integer("is_shutdown"):
+        if config.integer("is_shutdown"):
             await asyncio.sleep(SHUTDOWN_GRACE_S)
             return NodeShutdown(shutdown_sentence(name, "the message with the reason got lost"))
-        answer = await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
-        ticks = answer.message.integer("high") << 32 | answer.message.integer("clock")
+        ticks = uptime.integer("high") << 32 | uptime.integer("clock")
         if ticks < self._uptime_ticks:
             return restarted(name, "its uptime ran backwards")
         self._uptime_ticks = ticks
