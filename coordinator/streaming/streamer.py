@@ -161,7 +161,8 @@ class Streamer:
             while not isinstance(event, End):
                 self._called = False
                 self.cycles += 1
-                if self._rested:  # nothing came: it is done sooner than two threads are woken
+                rested, self._rested = self._rested, False
+                if rested:  # nothing came: it is done sooner than two threads are woken
                     cycle = self.worker.work(event)
                 else:
                     cycle = await loop.run_in_executor(thread, self.worker.work, event)
@@ -171,7 +172,9 @@ class Streamer:
                     self._report_output(cycle)
                     self._machine.stop(f"{self._job.name}:{event.line}: M112 stopped the machine")
                     return
-                await self._report_cycle(cycle, rested=self._rested)
+                self._report_cycle(cycle)
+                if cycle.batches:
+                    await asyncio.sleep(0)  # other tasks wait for one of the two, not for both
                 self._hand_over(cycle)  # last: links and buses begin to work then, and the loop rests
                 if isinstance(event, StandstillAction):
                     await self._attend(event)
@@ -197,7 +200,6 @@ class Streamer:
 
     async def _pause_for(self, pause_s: float) -> None:
         """Wait PAUSE_S, or until ``call``."""
-        self._rested = False
         if self._called:
             return
         loop = asyncio.get_running_loop()
@@ -251,21 +253,10 @@ class Streamer:
             self._on_output(output)
         self._act(self._due.take(self.print_time_now(), cycle.due))
 
-    async def _report_cycle(self, cycle: Cycle, *, rested: bool = False) -> None:
-        """Report CYCLE in steps, so that other tasks of the loop wait for one of them, not for all.
-
-        RESTED: there is so little to report that they need not wait.
-        """
-        for report in (
-            lambda: self._report_output(cycle),
-            lambda: self._on_state(cycle.planned),
-            self._on_cycle,
-        ):
-            if not rested:
-                await asyncio.sleep(0)
-            report()
-        if not rested:
-            await asyncio.sleep(0)
+    def _report_cycle(self, cycle: Cycle) -> None:
+        self._report_output(cycle)
+        self._on_state(cycle.planned)
+        self._on_cycle()
 
     def _act(self, due: Sequence[Due]) -> None:
         for print_time_s, timed in due:
@@ -284,7 +275,7 @@ class Streamer:
         while self.print_time_now() < self.ended_s + self.worker.steps.lag_s + SETTLE_S:
             cycle = await loop.run_in_executor(thread, self.worker.rest)
             self._hand_over(cycle)
-            await self._report_cycle(cycle)
+            self._report_cycle(cycle)
             await asyncio.sleep(CYCLE_S)
         self._act(self._due.rest())
         for node in self._nodes:
