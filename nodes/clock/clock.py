@@ -85,7 +85,7 @@ class ClockEstimate:
 class ClockEstimator:
     """Estimates one node's clock. NOMINAL_FREQ_HZ > 0 comes from its dictionary.
 
-    ``begin`` with the first answer to get_uptime, then ``add`` for every further one.
+    ``begin`` with the answer to get_uptime, then ``add`` for every answer to get_clock.
     """
 
     def __init__(self, nominal_freq_hz: int) -> None:
@@ -119,7 +119,7 @@ class ClockEstimator:
         return self._take(sent_ns, received_ns, Ticks(high * _WHOLE + clock32 % _WHOLE))
 
     def add(self, sent_ns: int, received_ns: int, clock32: int) -> bool:
-        """Process an answer: SENT_NS 0 means unknown. Return whether it was usable."""
+        """Process an answer to get_clock: SENT_NS 0 means unknown. Return whether it was usable."""
         middle_ns = HostTime((sent_ns + received_ns) // 2)
         return self._take(sent_ns, received_ns, extend32(clock32, self.estimate().ticks_at(middle_ns)))
 

@@ -7,13 +7,10 @@ from typing import Final
 
 from nodes.clock.clock import ClockEstimate, ClockEstimator
 from nodes.clock.wire_time import narrow
-from nodes.dictionary.message_format import Message
 from nodes.node.connector import ClockConnector
 from nodes.node.request_reply import Answer, QueryTimeout, RequestReply
 from nodes.support.errors import CanductorError
 
-UPTIME: Final = ("get_uptime", "uptime")
-CONFIG: Final = ("get_config", "config")
 SILENCE_S: Final = 0.25
 """A node that owes an acknowledgement and is silent for so long may have restarted: the bus is queried."""
 
@@ -21,11 +18,8 @@ SILENCE_S: Final = 0.25
 class ClockKeeper:
     """Keeps the clock of the node that TALK talks with, reached through CONNECTOR, until ``close``.
 
-    ON_ESTIMATE gets every new estimate; ON_LOST a sentence when the clock is no longer kept. While WATCHED
-    returns true, ON_WATCH is awaited with each answer to get_uptime and the one to get_config.
-
-    One exchange answers both: a computer and a bus that are otherwise at rest wake up once. The uptime is
-    first in the block and in what comes back, so that its times are those of an exchange of its own.
+    ON_ESTIMATE gets every new estimate; ON_SAMPLE is awaited after every sample and may raise whatever
+    RequestReply.ask raises; ON_LOST gets a sentence when the clock is no longer kept.
     """
 
     def __init__(
@@ -34,8 +28,7 @@ class ClockKeeper:
         connector: ClockConnector,
         *,
         on_estimate: Callable[[ClockEstimate], None],
-        watched: Callable[[], bool],
-        on_watch: Callable[[Message, Message], Awaitable[None]],
+        on_sample: Callable[[], Awaitable[None]],
         on_lost: Callable[[str], None],
     ) -> None:
         self.estimator = ClockEstimator(talk.dictionary.clock_freq_hz)
@@ -44,8 +37,7 @@ class ClockKeeper:
         self._talk = talk
         self._connector = connector
         self._on_estimate = on_estimate
-        self._watched = watched
-        self._on_watch = on_watch
+        self._on_sample = on_sample
         self._on_lost = on_lost
         self._silence: asyncio.TimerHandle | None = None
         """The next look for silence, while something was sent."""
@@ -68,16 +60,10 @@ class ClockKeeper:
     async def _keep(self) -> None:
         while True:
             try:
-                answers = await self._talk.ask_together((UPTIME, CONFIG) if self._watched() else (UPTIME,))
-                if answers[0] is not None:
-                    self._sampled(answers[0])
-                messages = [answer.message for answer in answers if answer is not None]
-                if len(messages) < len(answers):
-                    self._connector.suspect()  # the link decides when a silent node is lost
-                elif len(messages) > 1:
-                    await self._on_watch(*messages)
+                self._sampled(await self._ask())
+                await self._on_sample()
             except QueryTimeout:
-                self._connector.suspect()
+                self._connector.suspect()  # the link decides when a silent node is lost
             except CanductorError as error:
                 self._on_lost(str(error))
                 return
@@ -128,6 +114,11 @@ class ClockKeeper:
         if self.estimator.ready:
             self.ready.set()
 
+    async def _ask(self) -> Answer:
+        if self.estimator.accepted:
+            return await self._talk.ask("get_clock", "clock", tries=1, survives_shutdown=True)
+        return await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
+
     def _take(self, answer: Answer) -> bool:
         message = answer.message
         bitrate = self._talk.dictionary.int_constant("CANBUS_FREQUENCY", 0)
@@ -137,7 +128,7 @@ class ClockKeeper:
             self._connector.wire_ns(answer.asked_bytes, bitrate, answer=False),
             self._connector.wire_ns(answer.answered_bytes, bitrate, answer=True),
         )
-        if self.estimator.accepted:
+        if message.name == "clock":
             return self.estimator.add(sent_ns, received_ns, message.integer("clock"))
         return self.estimator.begin(sent_ns, received_ns, message.integer("high"), message.integer("clock"))
 

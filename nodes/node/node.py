@@ -475,15 +475,14 @@ class Node:
             self._talk,
             self._connector,
             on_estimate=lambda estimate: self._on_clock(self, estimate),
-            watched=lambda: self.state is NodeState.READY,
-            on_watch=self._look,
+            on_sample=self._look,
             on_lost=self.lose,
         )
         return self._keeper
 
-    async def _look(self, uptime: Message, config: Message) -> None:
+    async def _look(self) -> None:
         """Detect a restart or shutdown whose only message was lost."""
-        trouble = await self._watchdog.look(uptime, config) if self.state is NodeState.READY else None
+        trouble = await self._watchdog.look() if self.state is NodeState.READY else None
         if trouble is not None:
             shutdown = isinstance(trouble, NodeShutdown)
             self._fail(NodeEvent.SHUTDOWN if shutdown else NodeEvent.RESTARTED, trouble)

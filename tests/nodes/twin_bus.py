@@ -76,8 +76,6 @@ class TwinNode:
     executed: list[str] = field(default_factory=list)
     refuse: Callable[[Message], int | None] = lambda _: None
     """Returns the id of the text with which a command shuts the node down."""
-    deaf_to: set[str] = field(default_factory=set)
-    """Commands that it does not answer."""
 
     def __post_init__(self) -> None:
         text = json.dumps(self.source).encode()
@@ -130,8 +128,6 @@ class TwinNode:
     def _answer(self, message: Message, now_s: float) -> list[bytes]:
         if self.shut_down and message.name not in SURVIVING:
             return [self.response("is_shutdown", static_string_id=2)]
-        if message.name in self.deaf_to:
-            return []
         handler = getattr(self, "_" + message.name, None)
         answer: bytes | None = handler(message, now_s) if handler else None
         return [answer] if answer else []

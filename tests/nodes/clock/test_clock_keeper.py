@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from nodes.clock.clock import SETTLE_SAMPLES, ClockEstimate
-from nodes.dictionary.message_format import Message
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.errors import NodeLost, NodeShutdown
 from nodes.node.request_reply import RequestReply
@@ -53,9 +52,7 @@ class Bench:
         self.suspected_s: list[float] = []
         self.lost: list[str] = []
         self.blocks: list[tuple[int, int, bool]] = []
-        self.watched = True
-        self.watching: list[tuple[str, str]] = []
-        self.on_watch: Callable[[], None] = lambda: None
+        self.on_sample: Callable[[], None] = lambda: None
 
     # What a connector does:
 
@@ -68,10 +65,9 @@ class Bench:
 
     # ------------------------------------------------------------------------------------------------------
 
-    async def _watch(self, uptime: Message, config: Message) -> None:
+    async def _sampled(self) -> None:
         self.sampled_s.append(asyncio.get_running_loop().time())
-        self.watching.append((uptime.name, config.name))
-        self.on_watch()
+        self.on_sample()
 
     def run(self, main: Callable[[ClockKeeper], Awaitable[None]]) -> list[dict[str, Any]]:
         """Run MAIN beside a keeper, then close it; return what the loop was told of bugs."""
@@ -83,8 +79,7 @@ class Bench:
                 self.talk,
                 self,
                 on_estimate=self.estimates.append,
-                watched=lambda: self.watched,
-                on_watch=self._watch,
+                on_sample=self._sampled,
                 on_lost=self.lost.append,
             )
             await main(keeper)
@@ -115,9 +110,7 @@ def test_a_clock_is_learned_by_asking_often_and_kept_by_asking_now_and_then() ->
         await asyncio.sleep(2.5)
 
     assert bench.run(learn) == []
-    assert bench.asked == ["get_uptime", "get_config"] * 50
-    assert len(bench.link.sent) == 50, "both in one block"
-    assert bench.watching == [("uptime", "config")] * 50
+    assert bench.asked == ["get_uptime"] + ["get_clock"] * 49
     steps_s = [b - a for a, b in zip(bench.sampled_s[:-1], bench.sampled_s[1:], strict=True)]
     intervals_s = [0.025] * 15 + [0.05] * 32 + [0.9843] * 2
     assert [step_s - 2 * DELAY_S for step_s in steps_s] == pytest.approx(intervals_s, abs=1e-10)
@@ -164,8 +157,7 @@ def test_an_answer_of_unknown_times_is_not_used() -> None:
         known = len(bench.estimates)
         bench.twin.alive = False
         await asyncio.sleep(0.02)
-        bench.link.say(bench.twin.response("uptime", high=0, clock=5))  # a repeated block carries no time
-        bench.link.say(bench.twin.response("config", is_config=1, crc=0, is_shutdown=0, move_count=0))
+        bench.link.say(bench.twin.response("clock", clock=5))  # a repeated block carries no time
         await asyncio.sleep(0.01)
         assert keeper.estimator.unusable == 1
         assert len(bench.estimates) == known == len(bench.link.clocks)
@@ -186,7 +178,7 @@ def test_a_node_that_owes_answers_and_says_nothing_is_suspected_every_quarter_of
         await asyncio.sleep(0.1)
         assert len(bench.suspected_s) == 3, "an answer to the next question"
         await asyncio.sleep(0.25)
-        bench.link.say(bench.twin.response("uptime", high=0, clock=5))  # whatever it says
+        bench.link.say(bench.twin.response("clock", clock=5))  # whatever it says
         await asyncio.sleep(0.2)
         bench.suspected_s.clear()
         await asyncio.sleep(0.1)
@@ -216,25 +208,6 @@ def test_silence_is_looked_for_only_after_something_was_sent() -> None:
     bench.run(main)
 
 
-def test_the_configuration_is_asked_for_only_where_it_is_watched() -> None:
-    bench = Bench()
-    bench.watched = False
-    bench.run(sleeping(0.06))
-    assert bench.asked == ["get_uptime"] * 3
-    assert bench.watching == []
-    assert len(bench.estimates) == 3
-    assert bench.suspected_s == []
-
-
-def test_a_lost_configuration_is_suspicious_and_the_sample_counts() -> None:
-    bench = Bench()
-    bench.twin.deaf_to = {"get_config"}
-    bench.run(sleeping(0.27))
-    assert len(bench.estimates) == 1
-    assert bench.watching == []
-    assert [t - virtual_time.START_S for t in bench.suspected_s] == pytest.approx([0.25], abs=1e-6)
-
-
 def test_when_the_conversation_fails_keeping_the_clock_is_over() -> None:
     bench = Bench()
     bench.twin.alive = False
@@ -254,12 +227,12 @@ def test_a_shutdown_of_the_node_is_no_reason_to_lose_its_clock() -> None:
     bench = Bench()
 
     async def main(_: ClockKeeper) -> None:
-        await asyncio.sleep(0.0001)  # now it is asked
+        await asyncio.sleep(0.0001)  # now it is asked for its uptime
         bench.talk.fail(NodeShutdown("it stopped"), shutdown=True)
-        await asyncio.sleep(0.0259)  # ... and now again
+        await asyncio.sleep(0.0259)  # ... and now for its clock
         bench.talk.fail(NodeShutdown("it stopped"), shutdown=True)
         await asyncio.sleep(0.01)
-        assert bench.asked == ["get_uptime", "get_config"] * 2
+        assert bench.asked == ["get_uptime", "get_clock"]
         assert len(bench.estimates) == 2
 
     bench.run(main)
@@ -273,7 +246,7 @@ def test_a_bug_is_reported_and_the_node_given_up() -> None:
     def fail() -> None:
         raise bug
 
-    bench.on_watch = fail
+    bench.on_sample = fail
     bugs = bench.run(sleeping(1.0))
     assert [context["exception"] for context in bugs] == [bug]
     assert [text.split(";")[0] for text in bench.lost] == ["its clock is no longer kept"]

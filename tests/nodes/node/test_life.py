@@ -54,7 +54,6 @@ def test_commands_without_an_answer_raise_the_suspicion_too() -> None:
             await asyncio.sleep(0.001)
         machine.twin.reboot()
         machine.io.links[0]._to_node.append((b"", 0))  # never acknowledged
-        machine.io.links[0].on_sent()
         before_s = now_s()
         await machine.changed_to(NodeState.LOST)
         assert now_s() - before_s < 0.7
