@@ -276,6 +276,9 @@ def print_lead(ipc: Path) -> None:
 
 def print_stats(client: KlippyClient) -> dict[str, Any]:
     """Return how the print does; ends the benchmark when it does not print."""
+    info = client.call("info")
+    if info["state"] != "ready":
+        sys.exit(f"the machine stopped: {info['state_message']}")
     stats = client.call("objects/query", objects={"print_stats": None})["status"]["print_stats"]
     if stats["state"] not in ("printing", "standby"):  # it has begun, or is about to
         sys.exit(f"it does not print: {stats}")

@@ -7,6 +7,7 @@ ahead as it may be, after REST_CYCLE_S while the machine has nothing to do; or a
 """
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
@@ -66,6 +67,8 @@ class Streamer:
         self._at_rest = at_rest
         self._called = False
         """Since the cycle at hand began."""
+        self._rested = False
+        """Whether the cycle at hand comes after a rest in which nothing has come up."""
         self._pause: asyncio.Future[None] | None = None
         """Between two cycles."""
         self.cycles = 0
@@ -158,14 +161,20 @@ class Streamer:
             while not isinstance(event, End):
                 self._called = False
                 self.cycles += 1
-                cycle = await loop.run_in_executor(thread, self.worker.work, event)
+                rested, self._rested = self._rested, False
+                if rested:  # nothing came: it is done sooner than two threads are woken
+                    cycle = self.worker.work(event)
+                else:
+                    cycle = await loop.run_in_executor(thread, self.worker.work, event)
                 event = cycle.event
                 if isinstance(event, Emergency):
                     self._hand_over(cycle)
                     self._report_output(cycle)
                     self._machine.stop(f"{self._job.name}:{event.line}: M112 stopped the machine")
                     return
-                await self._report_cycle(cycle)
+                self._report_cycle(cycle)
+                if cycle.batches:
+                    await asyncio.sleep(0)  # other tasks wait for one of the two, not for both
                 self._hand_over(cycle)  # last: links and buses begin to work then, and the loop rests
                 if isinstance(event, StandstillAction):
                     await self._attend(event)
@@ -195,12 +204,16 @@ class Streamer:
             return
         loop = asyncio.get_running_loop()
         self._pause = loop.create_future()
-        timer = loop.call_later(pause_s, self._end_pause)
+        ends_s = loop.time() + pause_s
+        if pause_s == REST_CYCLE_S:  # together with the timers of modules
+            ends_s = math.floor(ends_s / pause_s) * pause_s
+        timer = loop.call_at(ends_s, self._end_pause)
         try:
             await self._pause
         finally:
             timer.cancel()
             self._pause = None
+        self._rested = pause_s == REST_CYCLE_S and not self._called and self._at_rest()
 
     def _end_pause(self) -> None:
         if self._pause is not None and not self._pause.done():
@@ -240,15 +253,10 @@ class Streamer:
             self._on_output(output)
         self._act(self._due.take(self.print_time_now(), cycle.due))
 
-    async def _report_cycle(self, cycle: Cycle) -> None:
-        """Report CYCLE in steps, so that other tasks of the loop wait for one of them, not for all."""
-        await asyncio.sleep(0)
+    def _report_cycle(self, cycle: Cycle) -> None:
         self._report_output(cycle)
-        await asyncio.sleep(0)
         self._on_state(cycle.planned)
-        await asyncio.sleep(0)
         self._on_cycle()
-        await asyncio.sleep(0)
 
     def _act(self, due: Sequence[Due]) -> None:
         for print_time_s, timed in due:
@@ -267,7 +275,7 @@ class Streamer:
         while self.print_time_now() < self.ended_s + self.worker.steps.lag_s + SETTLE_S:
             cycle = await loop.run_in_executor(thread, self.worker.rest)
             self._hand_over(cycle)
-            await self._report_cycle(cycle)
+            self._report_cycle(cycle)
             await asyncio.sleep(CYCLE_S)
         self._act(self._due.rest())
         for node in self._nodes:

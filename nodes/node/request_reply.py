@@ -4,12 +4,13 @@ Used on the control loop only. Responses can get lost, so a query is repeated.
 """
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
-from nodes.dictionary.message_format import Message, MessageError, Value
+from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value
 from nodes.link.interfaces import LinkInterface
 from nodes.link.types import Response
 from nodes.support.errors import CanductorError
@@ -41,13 +42,56 @@ class _Waiter:
     name: str
     asked_bytes: int
     matching: Mapping[str, Value]
-    answered: asyncio.Future[Answer]
+    answered: "asyncio.Future[Answer | None]"
+    """None: there was none in time."""
     survives_shutdown: bool
 
     def wants(self, message: Message) -> bool:
         return message.name == self.name and all(
             message.params.get(param) == value for param, value in self.matching.items()
         )
+
+
+class _Exchange:
+    """Calls SEND until WAITERS have their answers, up to TRIES times, TIMEOUT_S apart.
+
+    A timer does this, not a task that waits: an answer wakes only the task that asked.
+    """
+
+    def __init__(
+        self, send: Callable[[], None], waiters: Sequence[_Waiter], timeout_s: float, tries: int
+    ) -> None:
+        self._send = send
+        self._answers = [waiter.answered for waiter in waiters]
+        self._timeout_s = timeout_s
+        self._left = tries
+        self._timer: asyncio.TimerHandle | None = None
+
+    def send(self) -> None:
+        """Send, and again after the time-out."""
+        self._left -= 1
+        self._send()
+        self._timer = asyncio.get_running_loop().call_later(self._timeout_s, self._expire)
+
+    def _expire(self) -> None:
+        pending = [answer for answer in self._answers if not answer.done()]
+        if self._left and pending:
+            try:
+                self.send()
+            except CanductorError as error:  # the link is lost
+                for answer in pending:
+                    answer.set_exception(error)
+            return
+        for answer in pending:
+            answer.set_result(None)
+
+    def close(self) -> None:
+        """Send no more; answers come too late from now on."""
+        if self._timer is not None:
+            self._timer.cancel()
+        for answer in self._answers:
+            if not answer.cancel() and not answer.cancelled():
+                answer.exception()  # one of several failures is raised
 
 
 Callback = Callable[[Message], None]
@@ -129,26 +173,60 @@ class RequestReply:
         """
         args = args or {}
         content = self.encode(name, **args)
+        format_ = self._response_to(name, response)
+        if matching is None:
+            matching = {"oid": args["oid"]} if "oid" in args and "oid" in format_.names else {}  # type: ignore[dict-item]
+        waiter = self._waiter(response, len(content), matching, survives_shutdown=survives_shutdown)
+        with self._asking(content, [waiter], timeout_s, tries):
+            answer = await waiter.answered
+        if answer is None:
+            raise QueryTimeout(f"node {self.name} did not answer {name} within {tries * timeout_s:g} s")
+        return answer
+
+    async def ask_together(self, queries: Sequence[tuple[str, str]]) -> list[Answer | None]:
+        """Send QUERIES, commands without arguments and their responses, once and in one block.
+
+        Return the answers; None for one that does not arrive in QUERY_TIMEOUT_S. A shutdown of the node does
+        not end the wait. Raises as ``ask``, but for QueryTimeout.
+        """
+        content = b"".join(self.encode(name) for name, _ in queries)
+        for name, response in queries:
+            self._response_to(name, response)
+        waiters = [self._waiter(r, len(content), {}, survives_shutdown=True) for _, r in queries]
+        with self._asking(content, waiters, QUERY_TIMEOUT_S, tries=1):
+            return [await waiter.answered for waiter in waiters]
+
+    def _response_to(self, name: str, response: str) -> MessageFormat:
         format_ = self.dictionary.responses.get(response)
         if format_ is None:
             raise MessageError(f"node {self.name}: its firmware has no response {response!r} to {name}")
-        if matching is None:
-            matching = {"oid": args["oid"]} if "oid" in args and "oid" in format_.names else {}  # type: ignore[dict-item]
-        if len(self._waiters) >= MAX_WAITERS:
-            raise QueryTimeout(f"node {self.name}: {MAX_WAITERS} queries are unanswered; {name} was not sent")
-        answered: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
-        waiter = _Waiter(response, len(content), matching, answered, survives_shutdown)
-        self._waiters.append(waiter)
+        return format_
+
+    @staticmethod
+    def _waiter(
+        response: str, asked_bytes: int, matching: Mapping[str, Value], *, survives_shutdown: bool
+    ) -> _Waiter:
+        answered = asyncio.get_running_loop().create_future()
+        return _Waiter(response, asked_bytes, matching, answered, survives_shutdown)
+
+    @contextmanager
+    def _asking(
+        self, content: bytes, waiters: Sequence[_Waiter], timeout_s: float, tries: int
+    ) -> Iterator[None]:
+        """Send CONTENT, up to TRIES times, TIMEOUT_S apart; WAITERS without an answer get None at the end."""
+        if len(self._waiters) + len(waiters) > MAX_WAITERS:
+            raise QueryTimeout(
+                f"node {self.name}: {len(self._waiters)} queries are unanswered; one more was not sent"
+            )
+        exchange = _Exchange(lambda: self.link.send(content), waiters, timeout_s, tries)
+        self._waiters += waiters
         try:
-            for _ in range(tries):
-                self.link.send(content)
-                done, _pending = await asyncio.wait([answered], timeout=timeout_s)
-                if done:
-                    return answered.result()
+            exchange.send()
+            yield
         finally:
-            self._waiters.remove(waiter)
-            answered.cancel()
-        raise QueryTimeout(f"node {self.name} did not answer {name} within {tries * timeout_s:g} s")
+            exchange.close()
+            for waiter in waiters:
+                self._waiters.remove(waiter)
 
     # --------------------------------------------------------------------------------------------- receive
 

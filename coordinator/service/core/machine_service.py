@@ -45,9 +45,7 @@ from nodes.node.errors import NodeShutdown
 from nodes.support.errors import CanductorError
 
 REFRESH_S: Final = 0.1
-"""How often the state tree is brought up to date while somebody reads it."""
-UNREAD_S: Final = 1.0
-"""Likewise, while nobody does and something moves; at rest it is filled when somebody reads it."""
+"""How often the state tree is brought up to date while somebody reads it; else the next look fills it."""
 READ_S: Final = 1.5
 """So long after somebody has read it, it counts as being read."""
 BY_USER: Final = "emergency stop by"
@@ -137,9 +135,7 @@ class MachineService:
         self._shown_s = self._read_s = float("-inf")
         """When the tree was brought up to date, and when somebody wanted it to be."""
         self._reading = asyncio.Event()
-        """Set when ``_refresh`` has to go on: somebody reads the tree, or motion begins."""
-        self._refresh_rests = False
-        """Whether it waits for that."""
+        """Set when ``_refresh`` has to go on: somebody reads the tree."""
         state.bring_up_to_date = self._bring_up_to_date
         self.recovery = Recovery(self, settings.state)
         self.programs = Programs(self, self.recovery)
@@ -485,8 +481,6 @@ class MachineService:
         if wanted is not self.state:
             self._enter(wanted, held or "")
         self.tables.show_corrections()
-        if self._refresh_rests and self.moves:
-            self._reading.set()
 
     def _job_ended(self, job: JobRun) -> None:
         assert job.ended_s is not None
@@ -543,11 +537,7 @@ class MachineService:
                 await asyncio.sleep(REFRESH_S)
                 continue
             self._reading.clear()
-            self._refresh_rests = not self.moves
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(None if self._refresh_rests else UNREAD_S):
-                    await self._reading.wait()
-            self._refresh_rests = False
+            await self._reading.wait()
 
 
 def _confirmations(confirmed_s: dict[str, float]) -> str:
