@@ -83,7 +83,7 @@ class AnalogIn(Device):
         self._on_report(node, "analog_in_state", self._received)
         self._outside = None
         node.explain_shutdown(self._explain)
-        clock = start_clock(node, REPORT_S) % 2**32
+        clock = start_clock(node) % 2**32
         node.send("query_analog_in", oid=self._oid, clock=clock, **self._times, **self._limits)
 
     def stop(self, node: Node) -> None:

@@ -1,7 +1,6 @@
 """Conversion of seconds to a node's ticks, within the limits of the commands."""
 
 import asyncio
-import math
 from typing import Final
 
 from nodes.clock.clock import HostTime
@@ -35,14 +34,9 @@ def clock_after(node: Node, seconds: float) -> int:
     return node.best_clock.ticks_at(HostTime(round(at_s * 1e9)))
 
 
-def start_clock(node: Node, period_s: float = 0.0) -> int:
+def start_clock(node: Node) -> int:
     """Return the clock (64 bits) at which to begin on a NODE that has just become ready.
 
-    It is relative to now, since the last sample of its clock may be old on a busy host. What repeats every
-    PERIOD_S begins at a multiple of that: what nodes report at the same time wakes the host once.
+    It is relative to now, since the last answer to get_clock may be old on a busy host.
     """
-    ahead_s = START_AHEAD_S
-    if period_s:
-        now_s = asyncio.get_running_loop().time()
-        ahead_s = math.ceil((now_s + START_AHEAD_S) / period_s) * period_s - now_s
-    return clock_after(node, ahead_s)
+    return clock_after(node, START_AHEAD_S)

@@ -10,16 +10,16 @@ from nodes.node.node import Node
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 
 STALL_S = 0.7
-"""Longer than what begins is ahead of the clock's last sample, and shorter than a link's patience."""
+"""Longer than what begins is ahead of the last answer to get_clock, and shorter than a link's patience."""
 
 
 def ready_at_ns(folder: Path, monkeypatch: pytest.MonkeyPatch) -> int:
     """Return when the node of the hotend's sensor is ready, on a host that has nothing else to do."""
     stage, ready_ns = HeatMachine(folder, HOTEND_PID), list[int]()
 
-    def note(node: Node, period_s: float) -> int:
+    def note(node: Node) -> int:
         ready_ns.append(stage.stage.now_ns())
-        return start_clock(node, period_s)
+        return start_clock(node)
 
     async def main() -> None:
         await asyncio.sleep(0)
