@@ -30,6 +30,8 @@ RETIRED = {
     "no_answer": "connect_errors",
     "Answered": "ParserExit",
     "write_whole": "atomic_write",
+    "read_whole": "read_int",
+    "told_version": "version_text",
     "Desk": "Endpoint",
     "Reactions": "Engine",
     "Scanner": "Lexer",

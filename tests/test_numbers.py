@@ -11,7 +11,7 @@ from coordinator.cli.commands.demo import _ppm
 from coordinator.config.options import BadValue, FloatOption, IntOption
 from coordinator.gcode.parser import WordError, number
 from coordinator.modules.programs.gcode_macro import literal
-from nodes.support.numbers import read_decimal, read_whole
+from nodes.support.numbers import read_decimal, read_int
 from nodes.support.option_values import UsageError, parse_float, parse_hex, parse_int, parse_ratio
 
 NO_NUMBERS: Final = ("", "nan", "inf", "-Infinity", "1_0", "١٢", "1e999", "1e16", "0x", "1e", "--1", "1 2",
@@ -48,7 +48,7 @@ def test_what_is_a_number_is_the_same_everywhere() -> None:
         assert number("M104", {"S": text}, "S") == expected
         assert FloatOption(name="x", help="").parse(text) == expected
         assert parse_float(text, -1e15, 1e15) == expected
-    assert [read_whole("0x1F", may_be_hex=True), read_whole("0x1F"), read_whole("-7")] == [31, None, -7]
+    assert [read_int("0x1F", may_be_hex=True), read_int("0x1F"), read_int("-7")] == [31, None, -7]
 
 
 @pytest.mark.parametrize(

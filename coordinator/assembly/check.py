@@ -1,7 +1,7 @@
 """Finds everything that is wrong with a configuration, not only the first mistake.
 
 Single options are read on with a value that stands in. A mistake that ends the reading of a section is taken
-out, and all is read again; so nothing is told twice, and nothing that only follows from another mistake.
+out, and all is read again; so nothing is reported twice, and nothing that only follows from another mistake.
 """
 
 from typing import Final

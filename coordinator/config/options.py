@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar
 from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawOption, RawSection
 from coordinator.support.quoting import nearest, nearest_or_all, shown
-from nodes.support.numbers import read_decimal, read_whole
+from nodes.support.numbers import read_decimal, read_int
 
 T = TypeVar("T")
 _TRUE = ("1", "yes", "true", "on")
@@ -131,7 +131,7 @@ class IntOption(_Bounded[int]):
 
     def parse(self, text: str) -> int:
         """Return the number."""
-        value = read_whole(text)
+        value = read_int(text)
         if value is None:
             raise BadValue
         self._check(value)

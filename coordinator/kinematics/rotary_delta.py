@@ -81,10 +81,10 @@ class RotaryDelta(Kinematics):
 
     def arm_angle(self, arm: Arm, point: Point) -> float:
         """Return one upper arm's angle, rad above the horizontal; ValueError where the arm is too short."""
-        outward, beside = _turned(point, arm.angle)
+        outward, lateral = _turned(point, arm.angle)
         a, b = self.shoulder_radius - outward, self.shoulder_height - point[2]
         reach2 = a * a + b * b
-        k = (arm.lower_length**2 - beside**2 - arm.upper_length**2 - reach2) / (2 * arm.upper_length)
+        k = (arm.lower_length**2 - lateral**2 - arm.upper_length**2 - reach2) / (2 * arm.upper_length)
         if k * k > reach2:
             raise ValueError("an arm is too short or too long for this point")
         return math.atan2(b, a) - math.acos(k / math.sqrt(reach2))

@@ -1,4 +1,4 @@
-"""``canductor plan``: plans a program for a machine without its hardware, and tells what it would ask."""
+"""``canductor plan``: plans a program without the machine, and reports what it would demand of each node."""
 
 import time
 from contextlib import ExitStack

@@ -1,4 +1,4 @@
-"""What ``canductor plan`` tells: figures, warnings, and how they read."""
+"""What ``canductor plan`` reports: figures, warnings, and how they read."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

@@ -180,7 +180,7 @@ def _rounded(values: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def write_files(options: PlanOptions, report: PlanReport) -> PlanReport:
-    """Write the plot and, beside the streams, the report; return it with their names. CanductorError."""
+    """Write the plot and, next to the streams, the report; return it with their names. CanductorError."""
     paths = [options.output / f"{node.name}.batch" for node in report.nodes] if options.output else []
     plots = [options.plot] if options.plot else []
     if options.output:
@@ -205,6 +205,6 @@ def _write(path: Path, text: str) -> None:
 
 
 def _peak_rss_mb() -> float:
-    """Return the most memory that this process had. What getrusage tells includes that of who started it."""
+    """Return the most memory that this process had. getrusage includes that of the parent process."""
     with Path("/proc/self/status").open(encoding="ascii", errors="replace") as status:
         return next(int(line.split()[1]) / 1024 for line in status if line.startswith("VmHWM:"))

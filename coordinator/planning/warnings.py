@@ -10,9 +10,9 @@ from coordinator.planning.report import BusReport, NodeReport, StepperReport
 CEILING = 0.9
 """Share of a bus's bit rate that its links give out; what is left carries everything unplanned."""
 TICKS_PER_STEP = 100
-"""Clock ticks per step that a 32-bit core has time for beside its other work, when it counts its own cycles.
+"""Clock ticks per step that a 32-bit core has time for next to its other work, when it counts its own cycles.
 
-A dictionary tells the clock and the chip, but not what a step costs; with fewer it is asking for trouble.
+A dictionary has the clock and the chip, but not what a step costs; with fewer it is asking for trouble.
 """
 TICKS_PER_STEP_OF = {
     "atmega": 160,  # 8-bit: a step takes more instructions

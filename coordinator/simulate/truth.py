@@ -15,7 +15,7 @@ from nodes.virtual.edge_log import steps_of
 
 @dataclass(frozen=True, slots=True)
 class BoardTruth:
-    """All changes of a simulated board's outputs, oldest first; none was told by the code under test."""
+    """All changes of a simulated board's outputs, oldest first; none was reported by the code under test."""
 
     at_ns: Ints
     """True time."""

@@ -110,7 +110,7 @@ def text(value: object) -> str:
 def flag(value: object) -> bool:
     """Take true or false."""
     if not isinstance(value, bool):
-        raise ValueError("true or false")  # noqa: TRY004 (every rule is told by a ValueError)
+        raise ValueError("true or false")  # noqa: TRY004 (every rule is reported by a ValueError)
     return value
 
 

@@ -91,16 +91,16 @@ def _winch(params: Sequence[float], x: Floats, y: Floats, z: Floats) -> tuple[Fl
 
 def _rotary_delta(params: Sequence[float], x: Floats, y: Floats, z: Floats) -> tuple[Floats, Gradient]:
     upper, lower, radius, height, cos, sin = params[:6]
-    outward, beside = x * cos + y * sin, y * cos - x * sin
+    outward, lateral = x * cos + y * sin, y * cos - x * sin
     a, b = radius - outward, height - z
-    k = (lower**2 - beside**2 - upper**2 - a * a - b * b) / (2 * upper)
+    k = (lower**2 - lateral**2 - upper**2 - a * a - b * b) / (2 * upper)
     theta = np.arctan2(b, a) - np.arccos(k / np.hypot(a, b))
     # a·cos θ + b·sin θ = k: differentiate both sides by each coordinate.
     turn = b * np.cos(theta) - a * np.sin(theta)
     by_outward = (a / upper + np.cos(theta)) / turn
-    by_beside = -beside / upper / turn
+    by_lateral = -lateral / upper / turn
     by_z = (b / upper + np.sin(theta)) / turn
-    return theta, (by_outward * cos - by_beside * sin, by_outward * sin + by_beside * cos, by_z)
+    return theta, (by_outward * cos - by_lateral * sin, by_outward * sin + by_lateral * cos, by_z)
 
 
 INVERSE: Mapping[str, Inverse] = {

@@ -20,7 +20,7 @@ from nodes.virtual.plant import Axis, Coil, NodePlant, Stepper, Switch, Term
 
 AXES: Final = "xyz"
 START_MM: Final = 30.0
-"""How far from where it is after homing the head begins, along each axis, unless told otherwise."""
+"""How far from where it is after homing the head begins, along each axis, unless set otherwise."""
 BEYOND_MM: Final = 5.0
 """How far behind the end of an axis its stop stands."""
 RAD_PER_MM: Final = 0.01

@@ -25,7 +25,7 @@ from nodes.virtual.processes import Flavour, NodeProcess
 
 BITRATE = 1_000_000
 RATES_PPM = (-20.0, 60.0, -110.0, 35.0)
-"""How wrong the oscillators are, node by node, unless told otherwise: as on boards without good crystals."""
+"""How wrong the oscillators are, node by node, unless set otherwise: as on boards without good crystals."""
 ROLLOVER_AFTER_S = (1000.0, 20.0, 10.0, 35.0)
 """When the nodes' 32-bit clocks roll over: offsets that make some do it during the demo."""
 JITTER_US = 40

@@ -25,7 +25,7 @@ def read_decimal(text: str) -> float | None:
     return value
 
 
-def read_whole(text: str, *, may_be_hex: bool = False) -> int | None:
+def read_int(text: str, *, may_be_hex: bool = False) -> int | None:
     """Return the whole number that TEXT is; None: it is none. MAY_BE_HEX: also as in 0x1f."""
     if len(text) > CHARS_MAX:
         return None

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from nodes.support.errors import CanductorError
-from nodes.support.numbers import read_decimal, read_whole
+from nodes.support.numbers import read_decimal, read_int
 
 T = TypeVar("T")
 
@@ -121,7 +121,7 @@ def parse_assignment(text: str, convert: Callable[[str], T]) -> tuple[str, T]:
 
 def parse_int(text: str, low: int = 0, high: int | None = None, *, name: str = "") -> int:
     """Return a whole number from LOW to HIGH; raises UsageError."""
-    number = read_whole(text.strip())
+    number = read_int(text.strip())
     if number is None or number < low or (high is not None and number > high):
         bounds = f"of at least {low}" if high is None else f"from {low} to {high}"
         raise _invalid(name, text, f"a whole number {bounds}")
@@ -130,7 +130,7 @@ def parse_int(text: str, low: int = 0, high: int | None = None, *, name: str = "
 
 def parse_hex(text: str, high: int, *, name: str = "") -> int:
     """Return a number from 0 to HIGH that may be written in hex, as in 0x1f; raises UsageError."""
-    value = read_whole(text, may_be_hex=True)
+    value = read_int(text, may_be_hex=True)
     if value is None or not 0 <= value <= high:
         raise _invalid(name, text, f"a number from 0 to {high:#x}")
     return value

@@ -8,7 +8,7 @@ from typing import Final
 
 from coordinator.front_ends.serve import ServeOptions
 from coordinator.support.examples import machine_name
-from nodes.support.numbers import read_whole
+from nodes.support.numbers import read_int
 from nodes.support.option_values import UsageError, existing_file, options_from
 
 HOST_NAME_MAX: Final = 253
@@ -201,5 +201,5 @@ def _ip_address(text: str, examples: str) -> tuple[str, int]:
 def _host_port(text: str) -> tuple[str, int]:
     """Split HOST:PORT; the port is 0 if it is none."""
     host, _, port = text.rpartition(":")
-    number = read_whole(port) or 0
+    number = read_int(port) or 0
     return host.removeprefix("[").removesuffix("]"), number if 0 < number < 65536 else 0

@@ -10,7 +10,7 @@ from coordinator.demo.run import DemoOptions, run_demo
 from coordinator.demo.serve import serve_demo
 from coordinator.support.examples import DEMO_GCODE, DEMO_MACHINE, find_machine
 from coordinator.support.report import Report
-from nodes.support.numbers import read_decimal, read_whole
+from nodes.support.numbers import read_decimal, read_int
 from nodes.support.option_values import (
     Assignments,
     UsageError,
@@ -110,7 +110,7 @@ def _ppm(text: str) -> float:
 
 
 def _ticks(text: str) -> int:
-    ticks = read_whole(text)
+    ticks = read_int(text)
     if ticks is None or not 0 <= ticks < 2**64:
         raise ValueError("a whole number of ticks, from 0 to 2^64 - 1")
     return ticks

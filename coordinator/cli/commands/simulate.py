@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from coordinator.simulate.run import SimulateOptions, run_simulation
 from coordinator.support.report import Report
-from nodes.support.numbers import read_whole
+from nodes.support.numbers import read_int
 from nodes.support.option_values import UsageError, add_command, integer, options_from
 
 SEED_MAX: Final = 2**32
@@ -49,7 +49,7 @@ def _run(given: argparse.Namespace) -> Report:
 
 def _seeds(text: str) -> range:
     first, colon, end = text.partition(":")
-    low, high = read_whole(first), read_whole(end)
+    low, high = read_int(first), read_int(end)
     if not colon or low is None or high is None or low < 0:
         raise UsageError(f"is '{text}', must be A:B, two whole numbers such as 0:100")
     seeds = range(low, high)

@@ -109,7 +109,7 @@ def _line_of(error: BaseException) -> int:
 
 
 def _mark(node: "nodes.Node") -> None:
-    """Have every line of NODE's text begin with a mark that tells its number.
+    """Have every line of NODE's text begin with a mark that contains its number.
 
     Texts that a template keeps (``{% set %}`` blocks, macros) stay as they are: it may look at them.
     """

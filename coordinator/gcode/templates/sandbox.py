@@ -38,7 +38,7 @@ _WITH_WIDTH = ("batch", "center", "indent", "slice", "tojson", "truncate", "word
 _USELESS = ("urlize", "xmlattr")
 
 
-class TooMuch(Exception):  # noqa: N818 (told to the user as a sentence)
+class TooMuch(Exception):  # noqa: N818 (shown to the user as a sentence)
     """A template goes beyond its bounds."""
 
 

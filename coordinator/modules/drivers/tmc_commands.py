@@ -12,7 +12,7 @@ from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.support.quoting import nearest_or_all
 from nodes.devices.tmcuart import TmcUart
-from nodes.support.numbers import read_whole
+from nodes.support.numbers import read_int
 
 if TYPE_CHECKING:
     from coordinator.modules.drivers.tmc_driver import TmcDriver
@@ -142,7 +142,7 @@ class TmcCommands(Module):
             speed = value(call.command, given, "VELOCITY")
             number: int | None = driver.settings.tstep(speed) if speed > 0 else None
         else:
-            number = read_whole(given["VALUE"], may_be_hex=True)
+            number = read_int(given["VALUE"], may_be_hex=True)
         if number is None or not 0 <= number <= field.maximum:
             raise WordError(f"SET_TMC_FIELD: {field.name} takes whole numbers from 0 to {field.maximum}")
         return number

@@ -63,7 +63,7 @@ class AxisOptions:
     axis: str
     start: FloatOption
     end: FloatOption
-    beside: FloatOption
+    across: FloatOption
     heights: HeightsOption
     first: FloatOption
     last: FloatOption
@@ -71,7 +71,7 @@ class AxisOptions:
     @property
     def all(self) -> tuple[Option[Any], ...]:
         """All of them."""
-        return (self.start, self.end, self.beside, self.heights, self.first, self.last)
+        return (self.start, self.end, self.across, self.heights, self.first, self.last)
 
 
 def _axis_options(axis: str, other: str, heights: str) -> AxisOptions:
@@ -135,7 +135,7 @@ class AxisTwistCompensation(Module):
         self._speed, self._height = build.get(TRAVEL_SPEED), build.get(HEIGHT)
         self._probe: Probe | None = None
         self._ways = {
-            axis: tuple(build.find(option) for option in (options.start, options.end, options.beside))
+            axis: tuple(build.find(option) for option in (options.start, options.end, options.across))
             for axis, options in AXES.items()
         }
         self.compensations: dict[str, Compensation] = {}
@@ -177,18 +177,18 @@ class AxisTwistCompensation(Module):
         if given.get("AUTO", "0").lower() not in ("0", "false"):
             raise WordError(f"{command.name} AUTO=1 is not supported; the nozzle is lowered by hand")
         count = round(bounded(command, given, "SAMPLE_COUNT", COUNT, low=2, high=MOST))
-        start, end, beside = self._ways[axis]
+        start, end, across = self._ways[axis]
         options = AXES[axis]
-        if start is None or end is None or beside is None or not start < end:
+        if start is None or end is None or across is None or not start < end:
             raise WordError(
                 f"{command.name} of {axis} needs {options.start.name}, a higher {options.end.name} and"
-                f" {options.beside.name} of [{self.name}]"
+                f" {options.across.name} of [{self.name}]"
             )
         how = self._probe.how(command)
         self._probe.check(call)
         self._manual.check_free(call)
         along = [start + (end - start) * number / (count - 1) for number in range(count)]
-        places = [(at, beside) if axis == "X" else (beside, at) for at in along]
+        places = [(at, across) if axis == "X" else (across, at) for at in along]
         search = _Search(self, self._probe, call, how, Course(axis, start, end, tuple(places)))
         return Phases(search.run)
 

@@ -32,7 +32,7 @@ from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
-from nodes.support.numbers import read_whole
+from nodes.support.numbers import read_int
 
 LOWEST_C: Final = -273.15
 HIGHEST_C: Final = 1500.0
@@ -151,7 +151,7 @@ class HostTemperature(TemperatureSource):
             raise CanductorError(
                 f"[{self.name}]: {self._path} cannot be read: {error.strerror}; correct sensor_path"
             ) from None
-        thousandths = read_whole(text)
+        thousandths = read_int(text)
         if thousandths is None:
             raise CanductorError(
                 f"[{self.name}]: {self._path} holds {shown(text)}, not thousandths of a °C; correct"

@@ -137,6 +137,6 @@ class PrinterView(Mapping[str, Any]):
             seen, figures = self._look(), self._figures()
             self._all = {
                 **seen,
-                **{name: {**seen.get(name, {}), **told} for name, told in figures.items()},
+                **{name: {**seen.get(name, {}), **fields} for name, fields in figures.items()},
             }
         return self._all

@@ -1,6 +1,6 @@
 """Homing moves: steppers on any nodes stop when an endstop on any node switches, and it is known where.
 
-When all nodes involved are on one CAN bus and know trigger groups, the endstop's node tells the others
+When all nodes involved are on one CAN bus and know trigger groups, the endstop's node signals the others
 itself, within a frame or two. Otherwise the host relays: it receives the stop group of the endstop's node and
 triggers those of the others. In both cases every node stops by itself when it has not heard from the host
 for TIMEOUT_S, and the host goes on renewing that only while all nodes answer.

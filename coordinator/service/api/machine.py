@@ -25,14 +25,14 @@ _STATES: Final = (
 def machine_methods(service: MachineService) -> Iterator[Method]:
     """Return them."""
     started_s = time.time()
-    told_version = version()  # reads package data: once
+    version_text = version()  # reads package data: once
 
     def info(_caller: Caller, _params: dict[str, Any]) -> Value:
         described = None if service.machine is None else service.machine.description
         return {
             "name": service.settings.name,
             "id": service.settings.id,
-            "version": told_version,
+            "version": version_text,
             "host": platform.node(),
             "started_s": round(started_s, 3),
             "starts": service.starts,

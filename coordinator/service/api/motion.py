@@ -102,7 +102,7 @@ async def run_script(service: MachineService, script: str, *, wait: bool) -> Scr
             return ScriptOutcome((await _done(service, motion, work)).output)
         work.while_printing = True
         _check_while_printing(motion, names)
-        return ScriptOutcome((await _done(service, motion, work, aside=True)).output, logged=False)
+        return ScriptOutcome((await _done(service, motion, work, interjected=True)).output, logged=False)
 
 
 async def _run(service: MachineService, params: dict[str, Any]) -> Value:
@@ -227,10 +227,12 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
 # ------------------------------------------------------------------------------------------------ doing
 
 
-async def _done(service: MachineService, motion: Motion, work: Work, *, aside: bool = False) -> QueuedWork:
+async def _done(
+    service: MachineService, motion: Motion, work: Work, *, interjected: bool = False
+) -> QueuedWork:
     """Have WORK done; raises ApiError where it was not, for whatever reason."""
     try:
-        if aside and isinstance(work, LinesWork):
+        if interjected and isinstance(work, LinesWork):
             queued = await motion.do_interjection(work)
         else:
             queued = await motion.do(work)
@@ -365,14 +367,14 @@ class _StepsOfNodes:
     def __init__(self, service: MachineService) -> None:
         self._service = service
         self._asking: asyncio.Task[dict[str, int]] | None = None
-        self._told: dict[str, int] = {}
-        self._told_s = float("-inf")
+        self._answer: dict[str, int] = {}
+        self._answered_s = float("-inf")
 
     async def ask(self) -> dict[str, int]:
         """Return steps by stepper; raises CanductorError."""
         loop = asyncio.get_running_loop()
-        if loop.time() - self._told_s < _STEPS_KEPT_S:
-            return self._told
+        if loop.time() - self._answered_s < _STEPS_KEPT_S:
+            return self._answer
         if self._asking is None or self._asking.done():
             self._asking = loop.create_task(self._ask())
         return await asyncio.shield(self._asking)
@@ -384,5 +386,5 @@ class _StepsOfNodes:
             raise
         except CanductorError as error:
             raise ApiError("failed", str(error)) from None
-        self._told, self._told_s = found, asyncio.get_running_loop().time()
+        self._answer, self._answered_s = found, asyncio.get_running_loop().time()
         return found

@@ -31,7 +31,7 @@ def node_methods(service: MachineService) -> Iterator[Method]:
         node = service.up_machine().nodes.get(params["node"])
         if node is None:
             raise ApiError(
-                "bad_params", f"there is no node {params['node']!r}; nodes.list tells which there are"
+                "bad_params", f"there is no node {params['node']!r}; nodes.list returns those that there are"
             )
         service.log.add("notice", f"{caller.name} sends node {node.name}: {params['command']}")
         answer = await _send(node, params["command"], params["response"])

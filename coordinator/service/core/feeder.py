@@ -247,8 +247,8 @@ class Feeder:
         if self._waiting:
             self._now = self._waiting.popleft()
         elif self._held is not None and (not self._paused or self._held[0].cancelled):
-            (self._now, aside), self._held = self._held, None
-            self.planner.resume_program(aside)
+            (self._now, suspended), self._held = self._held, None
+            self.planner.resume_program(suspended)
         elif self._held is None and self._closed:
             return End(0, self.planner.print_time_end_s) if self.planner.flush() else Full()
         else:
@@ -277,12 +277,12 @@ class Feeder:
         """Go where the job was when it was paused; None when that is done."""
         lost = [axis for axis in saved.homed if axis not in self.planner.homed]
         problem, done = "", False
-        aside = self.planner.suspend_program()
+        suspended = self.planner.suspend_program()
         try:
             done = not lost and come_back(self.planner, saved, COME_BACK_MM_S)
         except WordError as error:
             problem = str(error)
-        self.planner.resume_program(aside)
+        self.planner.resume_program(suspended)
         if lost:
             problem = f"{' and '.join(lost)} must be homed with G28 before it can go on"
         if problem:
@@ -338,9 +338,9 @@ class Feeder:
         """Execute lines that neither move nor wait, return their events one by one; Full: one needs room."""
         while self._interjection is not None or self._interjections:
             queued = self._interjection = self._interjection or self._interjections.popleft()
-            aside = self.planner.suspend_program(moving=False)
+            suspended = self.planner.suspend_program(moving=False)
             done = self._do_interjection(queued)
-            self.planner.resume_program(aside)
+            self.planner.resume_program(suspended)
             if not done:
                 return Full()
             self._interjection = None

@@ -46,7 +46,7 @@ class Reached:
     part_mm: float = 0.0
     """Up to which height something was printed, in the machine's frame."""
     objects: ExcludeObject | None = None
-    """What was told of the program's objects; None: there is no [exclude_object]."""
+    """The program's objects as far as they were defined; None: there is no [exclude_object]."""
 
 
 def read_forward(description: "MachineDescription", program: Program, end_bytes: int) -> Reached:

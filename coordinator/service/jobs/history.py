@@ -1,6 +1,6 @@
 """The history of jobs: which ended lately, how and when.
 
-A small file outside the job folder, beside the journal; written when a job has ended.
+A small file outside the job folder, next to the journal; written when a job has ended.
 """
 
 import asyncio
