@@ -66,7 +66,7 @@ class BusCard {
     show(this.chart.element, Boolean(bitrate));
     show(this.keys, Boolean(bitrate));
     this.element.style.order = bitrate ? 0 : 1;
-    this.chart.tell(bitrate ? percent(get("load_total"), 1) : "–");
+    this.chart.setText(bitrate ? percent(get("load_total"), 1) : "–");
     for (const [key] of CLASSES) put(this.#keys[key], bitrate ? percent(get(`load_${key}`), 1) : "–");
     const is_serial = !get("frames_received") && get("bytes_received") > 0; // its frames are not counted, its bytes are
     for (const [key, , is_bad] of COUNTERS) {

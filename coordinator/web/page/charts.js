@@ -17,8 +17,8 @@ class Chart {
     this.sheet = new Sheet(this.canvas);
   }
 
-  /** Show TEXT beside the title, and to those who do not see the chart. */
-  tell(text) {
+  /** Show TEXT next to the title, and to those who do not see the chart. */
+  setText(text) {
     put(this.value, text);
     this.canvas.setAttribute("aria-label", `${this.title}: ${text}`);
   }

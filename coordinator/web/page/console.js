@@ -30,7 +30,7 @@ export class Console {
     $("line").disabled = $("send").disabled = !may;
   }
 
-  /** Show what was said meanwhile; STARTED tells one life of the coordinator from another. */
+  /** Show what was said meanwhile; STARTED distinguishes one run of the coordinator from another. */
   async begin(started) {
     if (this.#started !== null && this.#started !== started) {
       this.#last = 0;
@@ -43,8 +43,8 @@ export class Console {
 
   async #fill() {
     try {
-      const told = await this.#link.call("log.tail", { count: 200, after: this.#last });
-      for (const line of told.lines) this.#take(line);
+      const reply = await this.#link.call("log.tail", { count: 200, after: this.#last });
+      for (const line of reply.lines) this.#take(line);
     } catch (error) {
       if (error.code !== "offline") this.#add("bad", error.message, new Date());
     }
@@ -76,11 +76,11 @@ export class Console {
     this.#add("sent", `> ${script}`, new Date());
     this.#heard = [];
     try {
-      const told = await this.#link.call("gcode.run", { script });
-      // The log has it already, unless the line ran beside a job.
+      const reply = await this.#link.call("gcode.run", { script });
+      // The log has it already, unless the line ran while a job did.
       const unheard = (text) => !this.#heard.includes(text);
-      for (const text of told.replies.filter(unheard)) this.#add("reply", text, new Date());
-      for (const text of told.notices.filter(unheard)) this.#add("notice", text, new Date());
+      for (const text of reply.replies.filter(unheard)) this.#add("reply", text, new Date());
+      for (const text of reply.notices.filter(unheard)) this.#add("notice", text, new Date());
     } catch (error) {
       this.#add("bad", error.message, new Date());
     }

@@ -155,13 +155,13 @@ export class Job {
   }
 
   async #call(method, params) {
-    const told = $("job-told");
+    const line = $("job-error");
     try {
       await this.#link.call(method, params);
-      show(told, false);
+      show(line, false);
     } catch (error) {
-      put(told, error.message);
-      show(told, true);
+      put(line, error.message);
+      show(line, true);
     }
   }
 }

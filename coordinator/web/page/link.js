@@ -98,7 +98,7 @@ export class Link extends EventTarget {
 
   // ------------------------------------------------------------------------------------------------- inside
 
-  #tell(type, detail) {
+  #emit(type, detail) {
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 
@@ -113,18 +113,18 @@ export class Link extends EventTarget {
   }
 
   async #hello(socket) {
-    let told;
+    let hello;
     try {
-      told = await this.#request("api.hello", { version: 1, client: this.#client, token: this.#key ?? "" });
+      hello = await this.#request("api.hello", { version: 1, client: this.#client, token: this.#key ?? "" });
     } catch {
-      return; // the close that follows tells why
+      return; // the close that follows has the reason
     }
     if (socket !== this.#socket) return;
     this.#up = true;
     this.#tries = 0;
     if (this.#events.length) this.listen(this.#events);
     for (const watch of this.#watches.values()) this.#begin(watch);
-    this.#tell("up", told);
+    this.#emit("up", hello);
   }
 
   async #begin(watch) {
@@ -152,7 +152,7 @@ export class Link extends EventTarget {
 
   #take(message) {
     if (message.event === "state") this.#update(message);
-    else if (message.event) this.#tell("notification", message);
+    else if (message.event) this.#emit("notification", message);
     else if (message.id === undefined) this.#fault = message.error ?? null;
     else {
       const request = this.#open.get(message.id);
@@ -198,12 +198,12 @@ export class Link extends EventTarget {
     const has_to_sign_in = this.#fault ? SIGN_IN_CODES.has(this.#fault.code) : !opened && (await is_stranger());
     if (this.#socket) return; // another attempt was made meanwhile
     if (has_to_sign_in) {
-      this.#tell("refused");
+      this.#emit("refused");
       return;
     }
     const retry_ms = RETRY_MS[Math.min(this.#tries++, RETRY_MS.length - 1)];
     this.#retry = setTimeout(() => this.connect(), retry_ms);
-    this.#tell("down", { message: this.#fault?.message ?? "", retry_ms });
+    this.#emit("down", { message: this.#fault?.message ?? "", retry_ms });
   }
 }
 

@@ -40,7 +40,7 @@ export class Login {
 
   /** Show the form; FAULT says why, if something was wrong. */
   ask(fault) {
-    put($("login-told"), fault?.message ?? "Open the link that canductor prints, or give it here.");
+    put($("login-message"), fault?.message ?? "Open the link that canductor prints, or give it here.");
     show($("login"), true);
   }
 
@@ -51,20 +51,20 @@ export class Login {
   async #sign_in(token, keep) {
     show($("login"), false);
     let answer;
-    let told;
+    let reply;
     try {
       answer = await fetch("/login", { method: "POST", body: JSON.stringify({ token, keep }) });
-      told = await answer.json();
+      reply = await answer.json();
     } catch {
       this.ask({ message: "The machine cannot be reached. Try again." });
       return;
     }
     history.replaceState(null, "", location.pathname); // the code is of no use any more
     if (answer.ok) {
-      this.#key = told.key;
-      write(told.key);
+      this.#key = reply.key;
+      write(reply.key);
     } else if (!this.#key) {
-      this.ask(told);
+      this.ask(reply);
       return;
     }
     this.#on_key(this.#key); // a link that was used before does no harm to who is in

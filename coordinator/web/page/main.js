@@ -23,7 +23,7 @@ import { View } from "./view.js";
 const FAST = ["machine.", "job.", "position."];
 const SLOW = ["nodes.", "buses.", "tables.", "modules."];
 const SAMPLE_MS = 500;
-const HIDDEN_MS = 3000; // a tab that is hidden for so long is told nothing more until it is seen
+const HIDDEN_MS = 3000; // a tab that is hidden for so long gets nothing more until it is seen
 
 const login = new Login((key) => {
   link.connect(key);
@@ -144,9 +144,9 @@ function show_machine() {
     $("restart").disabled = !may;
   }
   const waits = fields.get("machine.waits_for");
-  const told = waits ?? (state === "paused" ? cause : "");
-  show($("waits"), !down && !stopped && Boolean(told));
-  put($("waits"), told ? sentence(`motion waits: ${told}`) : "");
+  const shown = waits ?? (state === "paused" ? cause : "");
+  show($("waits"), !down && !stopped && Boolean(shown));
+  put($("waits"), shown ? sentence(`motion waits: ${shown}`) : "");
 }
 
 function sentence(text) {

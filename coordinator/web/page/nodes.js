@@ -23,7 +23,7 @@ class NodeCard {
     this.title = make("h3", {}, name);
     this.state = make("span", { class: "pill" });
     this.about = make("small");
-    this.failure = make("p", { class: "told", hidden: "" });
+    this.failure = make("p", { class: "message", hidden: "" });
     this.charts = {
       drift: new LineChart("Drift, ppm", this.drift, { span: 2 }, 1, "c2"),
       offset: new LineChart("Offset gained, ms", this.offset, { span: 1 }, 2, "c2"),
@@ -74,37 +74,37 @@ class NodeCard {
   }
 
   #show_figures(get) {
-    const told = this.#figures;
+    const fields = this.#figures;
     const lead = get("lead_ms");
     const least = get("lead_min_ms");
-    put(told.lead, lead === null ? (least === null ? "–" : `${figure(least)} ms`) : lead < 0 ? "late" : `${figure(lead)} ms +`);
-    mark(told.lead, "level", lead !== null && lead < 0 ? "bad" : lead !== null && lead < LEAD_WARN_MS ? "warn" : "");
-    put(told.error, get("clock_error_us") === null ? "–" : `± ${figure(get("clock_error_us"))} µs`);
-    put(told.sent, count(get("commands_sent")));
-    put(told.repeated, `${count(get("retransmitted_blocks"))} blocks`);
-    mark(told.repeated, "level", get("retransmitted_blocks") ? "warn" : "");
-    put(told.trip, `${figure(get("round_trip_ms"), 2)} ms`);
-    put(told.task, get("load_task_us") === null ? "–" : `${figure(get("load_task_us"), 1)} µs`);
-    put(told.invalid, count(get("invalid_bytes")));
-    mark(told.invalid, "level", get("invalid_bytes") ? "warn" : "");
-    put(told.source, get("clock_source") ?? "–");
+    put(fields.lead, lead === null ? (least === null ? "–" : `${figure(least)} ms`) : lead < 0 ? "late" : `${figure(lead)} ms +`);
+    mark(fields.lead, "level", lead !== null && lead < 0 ? "bad" : lead !== null && lead < LEAD_WARN_MS ? "warn" : "");
+    put(fields.error, get("clock_error_us") === null ? "–" : `± ${figure(get("clock_error_us"))} µs`);
+    put(fields.sent, count(get("commands_sent")));
+    put(fields.repeated, `${count(get("retransmitted_blocks"))} blocks`);
+    mark(fields.repeated, "level", get("retransmitted_blocks") ? "warn" : "");
+    put(fields.trip, `${figure(get("round_trip_ms"), 2)} ms`);
+    put(fields.task, get("load_task_us") === null ? "–" : `${figure(get("load_task_us"), 1)} µs`);
+    put(fields.invalid, count(get("invalid_bytes")));
+    mark(fields.invalid, "level", get("invalid_bytes") ? "warn" : "");
+    put(fields.source, get("clock_source") ?? "–");
   }
 
   #show_charts(get) {
     const { charts } = this;
-    charts.drift.tell(figure(get("clock_drift_ppm"), 1));
+    charts.drift.setText(figure(get("clock_drift_ppm"), 1));
     const offset_s = get("clock_offset_s");
-    charts.offset.tell(offset_s === null ? "–" : `${figure((offset_s - this.#offset_s) * 1e3, 2)}`);
+    charts.offset.setText(offset_s === null ? "–" : `${figure((offset_s - this.#offset_s) * 1e3, 2)}`);
     charts.offset.element.title = offset_s === null ? "" : `since the page was opened; in all its clock is ${offset_s.toFixed(6)} s ahead of the computer's`;
-    charts.queue.tell(`${count(get("queue_commands"))}, most ${count(get("queue_commands_max"))}`);
-    charts.load.tell(percent(get("load_awake"), 1));
+    charts.queue.setText(`${count(get("queue_commands"))}, most ${count(get("queue_commands_max"))}`);
+    charts.load.setText(percent(get("load_awake"), 1));
     const all = this.#bins.at(-1) ?? [];
     const before = this.#bins[0] ?? [];
     const recent = all.map((value, i) => value - (before[i] ?? 0));
     const moved = recent.some((value) => value > 0);
     charts.lead.bins = moved ? recent : all;
     const least = get("lead_min_ms");
-    charts.lead.tell(`${moved ? "last 10 s" : "since the start"}${least === null ? "" : `, least ${figure(least)} ms`}`);
+    charts.lead.setText(`${moved ? "last 10 s" : "since the start"}${least === null ? "" : `, least ${figure(least)} ms`}`);
   }
 
   draw(now_s) {

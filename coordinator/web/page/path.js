@@ -49,26 +49,26 @@ export class Path {
   }
 
   /** Take an answer; return whether there is more to ask for. */
-  #take(told) {
-    if (told.generation !== this.#generation) {
-      this.#generation = told.generation;
+  #take(part) {
+    if (part.generation !== this.#generation) {
+      this.#generation = part.generation;
       this.count = 0;
       this.epoch++;
       this.box = null;
     }
-    const many = Math.min(told.x.length, POINTS_MAX - told.first);
-    for (let i = 0; i < many; i++) this.#put(told.first + i, told, i);
-    this.count = told.first + many;
-    return many > 0 && this.count < Math.min(told.count, POINTS_MAX);
+    const many = Math.min(part.x.length, POINTS_MAX - part.first);
+    for (let i = 0; i < many; i++) this.#put(part.first + i, part, i);
+    this.count = part.first + many;
+    return many > 0 && this.count < Math.min(part.count, POINTS_MAX);
   }
 
-  #put(at, told, i) {
-    this.x[at] = told.x[i];
-    this.y[at] = told.y[i];
-    this.z[at] = told.z[i];
-    this.times_s[at] = told.print_time_s[i];
-    this.extrudes[at] = told.extrudes[i] ? 1 : 0;
-    if (!told.extrudes[i]) return;
+  #put(at, part, i) {
+    this.x[at] = part.x[i];
+    this.y[at] = part.y[i];
+    this.z[at] = part.z[i];
+    this.times_s[at] = part.print_time_s[i];
+    this.extrudes[at] = part.extrudes[i] ? 1 : 0;
+    if (!part.extrudes[i]) return;
     if (at > 0) this.#widen(at - 1);
     this.#widen(at);
   }

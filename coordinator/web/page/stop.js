@@ -6,15 +6,15 @@ import { $, mark, put, show } from "./dom.js";
 import { Link } from "./link.js";
 
 const GIVE_UP_MS = 10_000; // a stop that could not be sent is not sent later than this: it would surprise
-const CONFIRM_MS = 2000; // then the user is told not to rely on it
-const TOLD_MS = 8000;
+const CONFIRM_MS = 2000; // then the user is warned not to rely on it
+const SHOWN_MS = 8000;
 
 export class Stop {
   #own;
   #other;
   #pressed_ms = null; // a stop that could not be sent yet
   #given_up = 0; // timer
-  #told = 0; // timer
+  #hiding = 0; // timer
   may = true;
 
   constructor(other) {
@@ -24,7 +24,7 @@ export class Stop {
       this.may = event.detail.scope !== "watch";
       this.#show();
       if (this.#pressed_ms !== null) this.#send();
-      else if ($("stop-told").dataset.state === "unsent") this.#fade();
+      else if ($("stop-message").dataset.state === "unsent") this.#fade();
     });
     this.#own.addEventListener("down", () => this.#show());
     this.#own.addEventListener("refused", () => this.#show());
@@ -43,21 +43,21 @@ export class Stop {
 
   press() {
     if (!this.may) {
-      this.#tell("refused", "This browser may only watch: the stop was not sent.");
+      this.#announce("refused", "This browser may only watch: the stop was not sent.");
       return;
     }
     this.#pressed_ms = performance.now();
     clearTimeout(this.#given_up);
-    this.#tell("sending", "Stopping…");
+    this.#announce("sending", "Stopping…");
     if (this.#own.up || this.#other.up) {
       this.#send();
       return;
     }
-    this.#tell("unsent", "NOT stopped: the machine cannot be reached. Use the switch on the machine.");
+    this.#announce("unsent", "NOT stopped: the machine cannot be reached. Use the switch on the machine.");
     this.#own.connect();
     this.#given_up = setTimeout(() => {
       this.#pressed_ms = null;
-      this.#tell("unsent", "NOT stopped: the machine could not be reached, and the stop is not sent any more. Press again.");
+      this.#announce("unsent", "NOT stopped: the machine could not be reached, and the stop is not sent any more. Press again.");
     }, GIVE_UP_MS);
   }
 
@@ -69,18 +69,18 @@ export class Stop {
     const links = [this.#own, this.#other].filter((link) => link.up);
     const asked = links.map((link) => link.call("machine.emergency_stop"));
     const late = setTimeout(() => {
-      this.#tell("unsent", "NOT confirmed yet. Use the switch on the machine.");
+      this.#announce("unsent", "NOT confirmed yet. Use the switch on the machine.");
     }, CONFIRM_MS);
     const settled = () => clearTimeout(late);
     Promise.any(asked).finally(settled).then(
-      () => this.#tell("done", `All nodes were told to stop, ${Math.ceil(performance.now() - began_ms)} ms after you asked.`),
-      (failure) => this.#tell("unsent", `NOT confirmed: ${failure.errors[0].message}. Use the switch on the machine.`),
+      () => this.#announce("done", `All nodes were told to stop, ${Math.ceil(performance.now() - began_ms)} ms after you asked.`),
+      (failure) => this.#announce("unsent", `NOT confirmed: ${failure.errors[0].message}. Use the switch on the machine.`),
     );
   }
 
-  #tell(state, text) {
-    clearTimeout(this.#told);
-    const line = $("stop-told");
+  #announce(state, text) {
+    clearTimeout(this.#hiding);
+    const line = $("stop-message");
     put(line, text);
     mark(line, "state", state);
     show(line, true);
@@ -88,8 +88,8 @@ export class Stop {
   }
 
   #fade() {
-    clearTimeout(this.#told);
-    this.#told = setTimeout(() => show($("stop-told"), false), TOLD_MS);
+    clearTimeout(this.#hiding);
+    this.#hiding = setTimeout(() => show($("stop-message"), false), SHOWN_MS);
   }
 
   #show() {

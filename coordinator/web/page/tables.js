@@ -16,7 +16,7 @@ class TableCard {
   constructor(axis) {
     this.path = `tables.${axis}`;
     this.state = make("span", { class: "pill" });
-    this.problem = make("p", { class: "told", hidden: "" });
+    this.problem = make("p", { class: "message", hidden: "" });
     const figures = make("dl", { class: "figures" });
     for (const [key, label] of FIGURES) {
       this.#figures[key] = make("dd", {}, "–");
