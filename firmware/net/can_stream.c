@@ -21,11 +21,11 @@ DECL_ENUMERATION("canbus_bus_state", "passive", 2);
 DECL_ENUMERATION("canbus_bus_state", "off", 3);
 
 static uint32_t receive_id(const struct can_stream *stream) {
-    return stream->node_id * 2u + 0x100;
+    return can_stream_receive_id(stream->node_id);
 }
 
 static uint32_t transmit_id(const struct can_stream *stream) {
-    return stream->node_id * 2u + 0x101;
+    return receive_id(stream) + 1;
 }
 
 void can_stream_attach(struct node *node, struct can_stream *stream) {

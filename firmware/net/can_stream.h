@@ -22,6 +22,10 @@ struct can_stream {
     struct bus_signals signals;
 };
 
+// The id of data for the node with NODE_ID; the next one is that of what it sends.
+static inline uint32_t can_stream_receive_id(uint8_t node_id) {
+    return node_id * 2u + 0x100;
+}
 // Connects STREAM to NODE, before node_start() and again at every restart: the id is dropped.
 void can_stream_attach(struct node *node, struct can_stream *stream);
 // A frame of SIZE <= 8 bytes came. Interrupt context allowed.

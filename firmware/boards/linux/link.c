@@ -44,6 +44,24 @@ static int open_virtual_can(const char *path) {
     return fd;
 }
 
+// Frames that are not for a node with NODE_ID need not even wake this process: a node that reads all that
+// others say falls behind on a busy computer. Without an id it reads all plain frames, since its first data
+// may follow the id at once. Narrower filters lose nothing: the kernel adds them before it drops the old
+// ones.
+static int filter_frames(int fd, uint8_t node_id) {
+    const canid_t plain = CAN_EFF_FLAG | CAN_RTR_FLAG, id = CAN_SFF_MASK;
+    const canid_t signal = id & ~(canid_t)(CAN_ID_URGENT_END - 1), pair = id & ~(canid_t)1;
+    const struct can_filter all = {.can_id = 0, .can_mask = plain};
+    const struct can_filter own[] = {
+        {.can_id = 0, .can_mask = plain | signal},
+        {.can_id = CAN_ID_ADMIN_REQUEST, .can_mask = plain | id},
+        {.can_id = CAN_ID_TABLES, .can_mask = plain | id},
+        {.can_id = can_stream_receive_id(node_id), .can_mask = plain | pair},
+    };
+    return node_id ? setsockopt(fd, SOL_CAN_RAW, CAN_RAW_FILTER, own, sizeof(own))
+                   : setsockopt(fd, SOL_CAN_RAW, CAN_RAW_FILTER, &all, sizeof(all));
+}
+
 static int open_socketcan(const char *interface) {
     struct sockaddr_can address = {.can_family = AF_CAN};
     address.can_ifindex = (int)if_nametoindex(interface);
@@ -52,9 +70,7 @@ static int open_socketcan(const char *interface) {
     int fd = socket(PF_CAN, SOCK_RAW | SOCK_CLOEXEC, CAN_RAW);
     if (fd < 0 || bind(fd, (const struct sockaddr *)&address, sizeof(address)))
         return complain("cannot open the CAN interface", interface);
-    // Extended and remote frames are not ours: they need not even wake this process.
-    const struct can_filter plain = {.can_id = 0, .can_mask = CAN_EFF_FLAG | CAN_RTR_FLAG};
-    if (setsockopt(fd, SOL_CAN_RAW, CAN_RAW_FILTER, &plain, sizeof(plain)))
+    if (filter_frames(fd, 0))
         return complain("cannot set up the CAN interface", interface);
     return fd;
 }
@@ -167,6 +183,10 @@ void link_hand_over(struct linux_board *board) {
         receive_bytes(board, board->in, board->in_size);
     else
         used = receive_frames(board, board->in, board->in_size);
+    const uint8_t node_id = board->can.node_id;
+    if (board->options.link == LINK_SOCKETCAN && node_id != board->filtered_id &&
+        !filter_frames(board->fd, node_id))
+        board->filtered_id = node_id;
     board->in_size -= used;
     memmove(board->in, board->in + used, board->in_size);
 }

@@ -38,6 +38,8 @@ struct linux_board {
     uint8_t failed;  // closed, and that is not how it should end
     uint8_t refused; // the node has more to say than `out` could take
 
+    uint8_t filtered_id; // for which SocketCAN lets frames pass; 0: all
+
     int fd, slave_fd, edge_fd;
     uint8_t out[OUT_BUFFER]; // waiting for the descriptor; whole frames on CAN
     size_t out_size;
