@@ -15,6 +15,7 @@ from coordinator.virtual_machine.plant_bed import BedSettings
 from nodes.virtual.plant import Bed
 from tests.stages.printer_text import section
 from tests.stages.probe_stage import OFFSET, ProbeStage, bed_height, heights, machine_text
+from tests.stages.served import Served, running
 
 START = (0.0, 0.0, 12.0)
 THREE = {"stepper_z": (-20.0, 100.0), "stepper_z1": (220.0, 0.0), "stepper_z2": (220.0, 200.0)}
@@ -130,6 +131,37 @@ def test_with_a_switch_for_z_its_zero_stays(tmp_path: Path) -> None:
     assert gap_over_bed(stage) < 0.01
     z = float(output[-1].split("Z:")[1].split()[0])
     assert z == pytest.approx(stage.true_mm("z"), abs=0.01)
+
+
+def test_it_is_levelled_by_hand(tmp_path: Path) -> None:
+    """Somebody lowers the nozzle onto the bed at each place; the second pass finds it level."""
+    bed = BedSettings(shape=TILTED, supports=THREE, raised_mm={"stepper_z1": 1.0, "stepper_z2": -1.0})
+    switch = {"endstop_pin": "PC7", "position_endstop": 5}
+    text = machine_text(z=switch, further_z=2, sections=levelling("z_tilt", retries=2))
+    stage = ProbeStage(tmp_path, text, bed=bed, start=START)
+    served = Served(tmp_path, lambda: stage.description, stage.host)
+
+    async def run(script: str) -> list[str]:
+        return list((await served.call("gcode.run", script=script))["replies"])
+
+    async def main() -> None:
+        async with running(served):
+            begun = await run("G28\nG1 Z9 F600\nZ_TILT_ADJUST METHOD=manual")
+            said, gaps = [begun], []
+            for number in range(6):
+                assert f"place {number % 3 + 1} of 3" in "".join(said[-1]), said
+                x, y = served.planned[:2]
+                z, slope_x, slope_y = frame(stage)
+                gap = z + slope_x * x + slope_y * y - bed_height(TILTED, x, y)
+                gaps.append(gap)
+                said.append(await run(f"TESTZ Z={-gap:.4f}\nACCEPT"))
+            assert passes(said[3]) == passes(said[6]) == 1
+            assert np.ptp(gaps[:3]) > 1
+            assert f"the heights are {np.ptp(gaps[:3]):.2f}" in said[3][1]
+            assert served.tree.get("modules.z_tilt.applied") is True
+
+    stage.run(main)
+    assert gap_over_bed(stage) < 0.01
 
 
 # ------------------------------------------------------------------------------------------ options, status

@@ -7,9 +7,10 @@ that is within the tolerance.
 import math
 from abc import abstractmethod
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from coordinator.config.errors import ConfigError, NotSupported
+from coordinator.config.errors import ConfigError
 from coordinator.config.options import BoolOption, FloatOption, IntOption, Option
 from coordinator.gcode.commands import (
     AtStandstill,
@@ -26,9 +27,9 @@ from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.drivers.motor_power import MotorPower
 from coordinator.modules.levelling.points import OPTIONS as POINT_OPTIONS
-from coordinator.modules.levelling.points import ProbePoints
+from coordinator.modules.levelling.points import ProbePoints, how_to_measure
 from coordinator.modules.levelling.surfaces import Place, adjustments, spread_mm
-from coordinator.modules.probes.probe import Measuring, Probe
+from coordinator.modules.probes.probe import Measured, Measuring, Probe
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.single import Ramp, SingleMove
 from coordinator.support.values import Value
@@ -80,6 +81,21 @@ SMALL_MM: Final = 1e-4
 """Less than a step: nothing to move."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Pass:
+    """One of the passes of a command."""
+
+    command: Command
+    retries: int
+    tolerance: float
+    """How far apart the heights may be at the end, mm."""
+    number: int = 1
+    before: float = math.inf
+    """How far apart they were in the pass before, mm."""
+    height: float | None = None
+    """Of the ways between places, mm; None: as the command or the section says."""
+
+
 class MotorLevelling(Module):
     """A section that levels by the motors of Z; COMMAND does it."""
 
@@ -88,7 +104,7 @@ class MotorLevelling(Module):
 
     def __init__(self, build: Build, places: Sequence[Place]) -> None:
         super().__init__(build)
-        self._machine, self._place = build.machine, build.place
+        self._machine = build.machine
         rail = next((rail for rail in build.machine.rails if rail.axis == "z"), None)
         self.motors = () if rail is None else rail.steppers
         """Those of Z, in order."""
@@ -110,10 +126,8 @@ class MotorLevelling(Module):
         build.add_command(self.COMMAND, self.HELP, self._read)
 
     def link(self, modules: Modules) -> None:
-        """Find the probe; raises ConfigError."""
-        self._probe = next((modules.find(name, Probe) for name in modules.names(Probe)), None)
-        if self._probe is None:
-            raise NotSupported(self._place, "it needs a probe that acts: [probe]")
+        """Find the probe; raises NotSupported for one that does not act yet."""
+        self._probe = self._points.find_probe(modules)
 
     async def connect(self, live: ModuleContext) -> None:
         """Take over the machine."""
@@ -139,64 +153,70 @@ class MotorLevelling(Module):
     # ---------------------------------------------------------------------------------------------- passes
 
     def _read(self, call: Call) -> Reading:
-        assert self._probe is not None
-        how = self._probe.how(call.command)
-        self._points.height(call.command)
+        how = how_to_measure(call, self._probe)
+        by = None if how is None or self._probe is None else (self._probe, how)
         given = call.parameters("RETRIES", "RETRY_TOLERANCE")
         retries = round(bounded(call.command, given, "RETRIES", self._retries, low=0, high=1000))
         tolerance = bounded(call.command, given, "RETRY_TOLERANCE", self._tolerance, low=0, high=100)
-        self._probe.check(call)
+        self._points.check(call, None if by is None else by[0])
         if missing := next((letter for letter in "XY" if letter not in call.homed), ""):
             raise WordError(f"{call.command.name} comes before {missing} is homed; home with G28 first")
-        return Phases(lambda job: self._run(job, call.command, how, (retries, tolerance)))
+        first = _Pass(call.command, retries, tolerance)
 
-    def _run(
-        self, job: ProgramContext, command: Command, how: Measuring, until: tuple[int, float]
+        def run(job: ProgramContext) -> Iterator[Reading]:
+            self.applied = False
+            yield from self._by_hand(job, first) if by is None else self._by_probe(job, first, *by)
+
+        return Phases(run)
+
+    def _by_probe(
+        self, job: ProgramContext, first: "_Pass", probe: Probe, how: Measuring
     ) -> Iterator[Reading]:
-        assert self._probe is not None
-        retries, tolerance = until
-        before = float("inf")
-        height = None
-        self.applied = False
-        for number in range(1, retries + 2):
-            found = yield from self._points.measure(job, command, self._probe, how, height=height)
+        now: _Pass | None = first
+        while now is not None:
+            found = yield from self._points.measure(job, now.command, probe, how, height=now.height)
             if found is None:
                 return
-            spread = yield from self._level(
-                job, command, [one.bed for one in found], (number, how.lift_speed)
-            )
-            if spread <= tolerance or retries == 0:
-                self.applied = True
-                return
-            if spread > before + self._increasing:
-                raise WordError(
-                    f"{command.name} failed: the heights are {spread:.4f} mm apart, more than {before:.4f} in"
-                    " the pass before: check that the motors are in the order of their places"
-                )
-            before = spread
-            if self._least_height is not None:
-                height = max(float(math.ceil(spread)), self._least_height)
-        raise WordError(
-            f"{command.name} failed: the heights are {before:.4f} mm apart after {retries + 1} passes, more"
-            f" than retry_tolerance ({tolerance:g} mm)"
-        )
+            now = yield from self._level(job, now, found, how.lift_speed)
+
+    def _by_hand(self, job: ProgramContext, now: "_Pass") -> Iterator[Reading]:
+        def measured(job: ProgramContext, found: list[Measured]) -> Iterator[Reading]:
+            further = yield from self._level(job, now, found, self._points.speed)
+            if further is not None:
+                yield from self._by_hand(job, further)
+
+        yield from self._points.collect(job, job.call(now.command), None, measured)
 
     def _level(
-        self, job: ProgramContext, command: Command, measured: Sequence[Point], how: tuple[int, float]
-    ) -> Generator[Reading, None, float]:
-        """Move the motors by what was MEASURED; return how far apart the heights were.
-
-        HOW: the number of the pass, and the speed of the motors, mm/s.
-        """
-        number, speed = how
+        self, job: ProgramContext, now: "_Pass", found: Sequence[Measured], speed: float
+    ) -> Generator[Reading, None, "_Pass | None"]:
+        """Move the motors by what was FOUND, at SPEED; return the pass that follows, None: all is level."""
+        measured = [one.bed for one in found]
         spread = spread_mm(measured)
         adjusts, mean = adjustments(self.heights(measured))
-        yield Immediate((self._report(number, spread, adjusts),))
+        yield Immediate((self._report(now.number, spread, adjusts),))
         if why := self.check(adjusts):
-            raise WordError(f"{command.name} failed: {why}")
-        call = job.call(command)
+            raise WordError(f"{now.command.name} failed: {why}")
+        call = job.call(now.command)
         yield AtStandstill(lambda: self._adjust(call, adjusts, mean, speed))
-        return spread
+        if spread <= now.tolerance or now.retries == 0:
+            self.applied = True
+            return None
+        if spread > now.before + self._increasing:
+            raise WordError(
+                f"{now.command.name} failed: the heights are {spread:.4f} mm apart, more than"
+                f" {now.before:.4f} in the pass before: check that the motors are in the order of their"
+                " places"
+            )
+        if now.number > now.retries:
+            raise WordError(
+                f"{now.command.name} failed: the heights are {spread:.4f} mm apart after {now.number} passes,"
+                f" more than retry_tolerance ({now.tolerance:g} mm)"
+            )
+        height = None
+        if self._least_height is not None:
+            height = max(float(math.ceil(spread)), self._least_height)
+        return replace(now, number=now.number + 1, before=spread, height=height)
 
     def _report(self, number: int, spread: float, adjusts: Sequence[float]) -> str:
         moves = ", ".join(f"{motor.name} {by:+.4f}" for motor, by in zip(self.motors, adjusts, strict=True))

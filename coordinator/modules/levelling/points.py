@@ -118,7 +118,8 @@ class ProbePoints:
         self._manual = build.shared(ManualProbe)
         self._place = build.place
         self._left_out = [name for name in build.unsupported if name.partition(" ")[0] in PROBES]
-        self._speed, self._height = build.get(TRAVEL_SPEED), build.get(HEIGHT)
+        self.speed, self._height = build.get(TRAVEL_SPEED), build.get(HEIGHT)
+        """Of the ways, mm/s, and how high they are, mm."""
         self._by_probe = build.get(by_probe)
 
     def find_probe(self, modules: Modules) -> Probe | None:
@@ -209,12 +210,12 @@ class ProbePoints:
         known: list[Measured],
         found: Found,
     ) -> Iterator[Reading]:
-        yield from lift(job, self.height(command), self._speed)
+        yield from lift(job, self.height(command), self.speed)
         if len(known) == len(places):
             yield from found(job, known)
             return
         x, y = places[len(known)]
-        yield ProgramAction(lambda job: go(job, [x, y, *job.planner.toolhead_position[2:]], self._speed))
+        yield ProgramAction(lambda job: go(job, [x, y, *job.planner.toolhead_position[2:]], self.speed))
         yield Immediate((f"place {len(known) + 1} of {len(places)}: {x:.3f},{y:.3f}",))
 
         def accepted(job: ProgramContext, at: Point) -> Iterator[Reading]:
@@ -228,7 +229,7 @@ class ProbePoints:
         """Bring the nozzle, or the probe, above PLACE."""
         yield from lift(job, height, lift_speed)
         dx, dy = probe.offset[:2] if self._by_probe else (0.0, 0.0)
-        x, y, speed = place[0] - dx, place[1] - dy, self._speed
+        x, y, speed = place[0] - dx, place[1] - dy, self.speed
 
         def act(job: ProgramContext) -> bool:
             return go(job, [x, y, *job.planner.toolhead_position[2:]], speed)
