@@ -214,6 +214,16 @@ def test_power_goes_stale_after_its_time_and_not_at_it(chamber: Driven) -> None:
     assert len(live.later) == waiting
 
 
+def test_one_timer_watches_the_power_however_often_it_is_renewed(chamber: Driven) -> None:
+    unit, live = chamber.unit, chamber.live
+    chamber.measured(20.0)
+    assert live.later == [], "it is off"
+    unit.set_target(60.0)
+    for _ in range(5):
+        chamber.measured(20.0)
+    assert [seconds for seconds, _ in live.later] == [unit._stale_s]
+
+
 def test_how_long_power_lasts_follows_from_max_duration(tmp_path: Path) -> None:
     unit = heater(tmp_path, HOTEND_PID + CHAMBER + "max_duration: 3\n", "chamber")
     assert unit._stale_s == pytest.approx(2.4)
