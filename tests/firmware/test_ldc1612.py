@@ -105,6 +105,16 @@ def test_what_the_host_does_not_take_is_counted_as_lost() -> None:
     assert host.ask(f"query_status_ldc1612 oid={LDC}")["possible_overflows"] > 100
 
 
+def test_a_silent_sensor_is_an_error_in_every_tenth_look() -> None:
+    host = reading_host()
+    fault(host, PlantFault.DEAD)
+    query(host)
+    host.run(ms(host, 1000))
+    said = host.ask(f"query_status_ldc1612 oid={LDC}")
+    readings = said["next_sequence"] * 12 + said["buffered"] // 4
+    assert readings == 500 // 10
+
+
 def test_a_reading_above_the_threshold_triggers_the_stop_group_not_before_its_time() -> None:
     host = reading_host()
     query(host)

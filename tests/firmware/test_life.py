@@ -85,6 +85,7 @@ def test_statistics_come_every_five_seconds() -> None:
     stats = [a for a in host.unasked if a.name == "stats"]
     assert len(stats) == 10
     assert all(a["count"] >= 1 and a["sum"] == 0 for a in stats)
+    assert len({a["count"] for a in stats[1:]}) == 1, "each is of its own five seconds"
     assert host.node.next_deadline() == 55 * FREQ
 
 

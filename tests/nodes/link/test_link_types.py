@@ -1,6 +1,6 @@
 """The values that pass between a link and its users: defaults, bounds, sums."""
 
-from dataclasses import fields
+from dataclasses import astuple, fields, replace
 
 import pytest
 
@@ -43,6 +43,11 @@ def test_settings_of_a_bus_have_bounds(
     for bad in (below, above):
         with pytest.raises(LinkError, match=str(bad)):
             BusSettings(**{name: bad})  # type: ignore[arg-type]
+
+
+def test_a_link_that_did_nothing_counts_nothing() -> None:
+    assert not any(astuple(replace(LinkStats(), motion=0, control=0, bulk=0, received=0)))  # type: ignore[arg-type]
+    assert not any(astuple(Flow()))
 
 
 def test_a_load_is_the_sum_of_its_shares() -> None:

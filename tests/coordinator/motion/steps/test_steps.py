@@ -8,7 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.coordinator.motion.steps_harness import MACHINES, MAX_ERROR_S, ORIGIN, Run, X, node_spec, stepper
+from coordinator.motion.steps._steps import lib
+from coordinator.motion.steps.steps import StepGenerator
+from tests.coordinator.motion.steps_harness import (
+    MACHINES,
+    MAX_ERROR_S,
+    ORIGIN,
+    Run,
+    X,
+    node_spec,
+    rows,
+    stepper,
+)
 from tests.coordinator.motion.steps_oracle import Move, fewest_segments, make_move, step_times
 from tests.profiles import examples
 
@@ -106,6 +117,27 @@ def test_a_flush_between_two_opposite_steps_puts_the_second_off() -> None:
     assert clocks[11] - clocks[10] >= 2 * 2e-6 * 168e6
     assert abs(clocks[11] / 168e6 - moves[1].print_time) < MAX_ERROR_S
     assert run.gen.stats().steppers[0].put_off == 1
+
+
+def test_a_batch_is_full_while_the_longest_segment_would_still_fit() -> None:
+    """Nothing may be written beyond a batch's end, whatever the next segment takes."""
+    longest = 3 * (17 + 2 * 5 + 3 * 5)  # three commands: a record's header, id and oid, values
+    gen = StepGenerator([stepper(0, X)], [node_spec()])
+    t, made = 1.0, 0
+    for full in range(3):
+        while True:
+            move = make_move(t, ORIGIN, (0.05, 0.0, 0.0, 0.0), (0.0, 5.0, 0.0), 9000)
+            back = make_move(t + move.total_s, move.end, ORIGIN, (0.0, 5.0, 0.0), 9000)
+            t += move.total_s + back.total_s
+            assert gen.append(rows([move, back]), 2) == 2
+            if not gen.generate(t):
+                break
+        stats = gen.stats()
+        room = lib.STEP_OUT_BYTES - stats.nodes[0].waiting_bytes
+        made = max(made, stats.nodes[0].waiting_bytes // stats.steppers[0].queue_steps)
+        assert longest - 2 * made < room < longest, full
+        while gen.take_batch(0):
+            pass
 
 
 def test_segments_are_close_to_the_fewest_possible(record_property: Callable[[str, object], None]) -> None:
