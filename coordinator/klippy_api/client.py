@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from coordinator.klippy_api.move_dump import MoveDump
+from coordinator.klippy_api.step_dump import StepDump
 from coordinator.klippy_api.subscription import Subscription
 from coordinator.klippy_api.wire import (
     Framer,
@@ -20,7 +21,7 @@ RUNNING_MAX: Final = 64
 """Calls of one client that run; more are answered with an error."""
 REMOTE_METHODS_MAX: Final = 64
 DUMPS_MAX: Final = 16
-"""Dumps of moves that one client receives."""
+"""Dumps of moves that one client receives, and of steppers as many."""
 
 
 class Client:
@@ -33,7 +34,8 @@ class Client:
         """The template of lines that g-code answers; None: it does not listen to them."""
         self.remote_methods: dict[str, Mapping[str, Any]] = {}
         """Templates by name."""
-        self.dumps: list[MoveDump] = []
+        self.move_dumps: list[MoveDump] = []
+        self.step_dumps: list[StepDump] = []
         self.running = 0
         """Calls that are not answered yet."""
         self.dropped = 0
@@ -43,6 +45,11 @@ class Client:
         self._framer = Framer()
         self._urgent: deque[bytes] = deque()
         self._waiting: deque[bytes] = deque()
+
+    @property
+    def listens(self) -> bool:
+        """Whether it wants to hear what changes."""
+        return bool(self.subscription is not None or self.move_dumps or self.step_dumps)
 
     @property
     def has_work(self) -> bool:

@@ -4,17 +4,20 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any, Final
 
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.klippy_api.client import DUMPS_MAX, REMOTE_METHODS_MAX, Client
-from coordinator.klippy_api.move_dump import HEADER, TOOLHEAD, MoveDump
+from coordinator.klippy_api.move_dump import HEADER as MOVE_HEADER
+from coordinator.klippy_api.move_dump import TOOLHEAD, MoveDump
 from coordinator.klippy_api.params import RequestError, objects_param, template_param, text_param
 from coordinator.klippy_api.script import run_lines
 from coordinator.klippy_api.status import StatusBuilder, state_of
+from coordinator.klippy_api.step_dump import HEADER as STEP_HEADER
+from coordinator.klippy_api.step_dump import StepDump
 from coordinator.klippy_api.subscription import Subscription, select_fields
 from coordinator.klippy_api.wire import Request
 from coordinator.modules.homing.homing import Homing
@@ -85,7 +88,10 @@ class Endpoints:
             "pause_resume/resume": lambda _client, _request: self._lines("RESUME"),
             "pause_resume/cancel": lambda _client, _request: self._lines("CANCEL_PRINT"),
         }
-        self._moving: dict[str, Endpoint] = {"motion_report/dump_trapq": self._dump_moves}
+        self._moving: dict[str, Endpoint] = {
+            "motion_report/dump_trapq": self._dump_moves,
+            "motion_report/dump_stepper": self._dump_steps,
+        }
         self._levelling: dict[str, Endpoint] = {"bed_mesh/dump_mesh": self._dump_mesh}
         self._homing: dict[str, Endpoint] = {"query_endstops/status": self._endstops}
 
@@ -142,15 +148,18 @@ class Endpoints:
             raise RequestError(f"{request.method}: {error}") from None
 
     def _dump_moves(self, client: Client, request: Request) -> Result:
-        name, template = text_param(request, "name"), template_param(request)
         described, motion = self._service.up_machine().description, self._service.ready_motion()
         known = [TOOLHEAD, *(extruder.name for extruder in described.extruders)]
-        if name not in known:
-            raise RequestError(f"{request.method}: 'name' must be one of {', '.join(known)}")
-        if len(client.dumps) >= DUMPS_MAX:
-            raise RequestError(f"a client may have {DUMPS_MAX} dumps")
-        client.dumps.append(MoveDump(name, template, motion.now_s))
-        return {"header": HEADER}
+        name = _dumped(request, known, client.move_dumps)
+        client.move_dumps.append(MoveDump(name, template_param(request), motion.now_s))
+        return {"header": MOVE_HEADER}
+
+    def _dump_steps(self, client: Client, request: Request) -> Result:
+        machine, motion = self._service.up_machine(), self._service.ready_motion()
+        known = [stepper.name for stepper in machine.description.steppers]
+        name = _dumped(request, known, client.step_dumps)
+        client.step_dumps.append(StepDump(name, template_param(request), motion, machine))
+        return {"header": STEP_HEADER}
 
     def _endstops(self, _client: Client, _request: Request) -> Awaitable[Result]:
         job = self._service.active_job
@@ -215,3 +224,13 @@ class Endpoints:
     def _emergency_stop(self, _client: Client, _request: Request) -> Result:
         self._service.emergency_stop(WHO)
         return {}
+
+
+def _dumped(request: Request, known: Sequence[str], dumps: Sized) -> str:
+    """Return the name of what REQUEST wants to hear about, one of KNOWN; raises RequestError."""
+    name = text_param(request, "name")
+    if name not in known:
+        raise RequestError(f"{request.method}: 'name' must be one of {', '.join(known)}")
+    if len(dumps) >= DUMPS_MAX:
+        raise RequestError(f"{request.method}: a client may have {DUMPS_MAX} of them")
+    return name

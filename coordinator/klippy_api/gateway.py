@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import socket
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -262,7 +262,7 @@ class Gateway:
         except Exception as error:  # noqa: BLE001 (a bug of one endpoint must not end the machine)
             self._fail(connection, request, self._sentence(request, error))
             return
-        if client.subscription is not None or client.dumps:
+        if client.listens:
             self._subscribed.set()
         if isinstance(result, Awaitable):
             client.running += 1
@@ -307,14 +307,22 @@ class Gateway:
             await self._subscribed.wait()
             await asyncio.sleep(UPDATE_S)
             self._try_to_send()
+            with self._surviving():
+                await self._send_steps()
 
     def _send_early(self) -> None:
         self._early = None
         self._try_to_send()
 
     def _try_to_send(self) -> None:
-        try:
+        with self._surviving():
             self._send_changes()
+
+    @contextlib.contextmanager
+    def _surviving(self) -> Iterator[None]:
+        """Report what fails; updates go on."""
+        try:
+            yield
         except CanductorError:
             return  # it is stopped or closed in this moment: the next look finds how it is then
         except Exception as error:  # noqa: BLE001 (a bug of one module's status must not end all updates)
@@ -323,7 +331,7 @@ class Gateway:
             )
 
     def _send_changes(self) -> None:
-        waiting = [c for c in self._connections if c.client.subscription is not None or c.client.dumps]
+        waiting = [connection for connection in self._connections if connection.client.listens]
         if not waiting:
             self._subscribed.clear()
         reading = [connection for connection in waiting if connection.writable]
@@ -350,10 +358,19 @@ class Gateway:
             return
         active = motion.planned.figures.get("toolhead", {}).get("extruder")
         for connection in reading:
-            for dump in connection.client.dumps:
+            for dump in connection.client.move_dumps:
                 rows = dump.take(motion.trace, motion.now_s, active)
                 if rows:
                     connection.send(event_message(dump.template, {"data": rows}))
+
+    async def _send_steps(self) -> None:
+        for connection in list(self._connections):
+            for dump in connection.client.step_dumps:
+                motion, machine = self._service.motion, self._service.machine
+                if motion is None or machine is None or machine.stopped is not None:
+                    return
+                if connection.writable and (params := await dump.take(motion, machine)):
+                    connection.send(event_message(dump.template, params))
 
     def say(self, text: str) -> None:
         """Show TEXT to all who listen to g-code, together with what else comes in this round of the loop."""

@@ -1,6 +1,6 @@
 """Interfaces of the pipeline: a source of moves, and an observer of moves and commands."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -55,8 +55,8 @@ class Witness(Protocol):
     def see_moves(self, trapezoids: Any, count: int) -> None:
         """Record moves (``struct trapezoid *``), in the worker's thread; they are gone afterwards."""
 
-    def see_batch(self, node: int, batch: bytes) -> None:
-        """Record commands for a moving node, on the control loop."""
+    def see_sent(self, batches: Sequence[tuple[int, bytes]], planned: "Planned") -> None:
+        """Record commands for moving nodes, on the control loop; PLANNED counts their steps, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,9 @@ class Planned:
     stands_from_s: float | None
     """Print time from which nothing moves any more; None: there is more to plan."""
     steps_sent: tuple[int, ...] = ()
-    """By stepper: steps from the start that its commands add up to."""
+    """By stepper: where its node will count it when all commands in batches are executed."""
+    last_step_clocks: tuple[int, ...] = ()
+    """By stepper: its node's 64-bit clock at the last of those steps; 0: there is none."""
     offset: Position = (0.0, 0.0, 0.0, 0.0)
     """SET_GCODE_OFFSET."""
     figures: Mapping[str, Mapping[str, object]] = field(default_factory=dict)

@@ -242,9 +242,9 @@ class Streamer:
             self._machine.modules.before_motion(cycle.stepping)
         for node, batch in cycle.batches:
             link_of(self._nodes[node]).send_batch(batch)
-            if self._witness is not None:
-                self._witness.see_batch(node, batch)
         if cycle.batches:
+            if self._witness is not None:
+                self._witness.see_sent(cycle.batches, cycle.planned)
             self._machine.check_load()
         self._look_at_load()
 

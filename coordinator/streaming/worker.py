@@ -22,7 +22,7 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.status import motion_figures
 from coordinator.motion.planner.planner import Planner
-from coordinator.motion.steps.steps import StepGenerator
+from coordinator.motion.steps.steps import StepGenerator, StepperStats
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.timebase import ClockMap
 from coordinator.streaming.compensation import Compensation
@@ -188,6 +188,7 @@ class MotionWorker:
     def _planned(self) -> Planned:
         planner = self._planner
         stands = planner.at_standstill and not planner.take().count
+        steppers = self.steps.stats().steppers
         return Planned(
             position=planner.toolhead_position,
             gcode=planner.gcode_position,
@@ -196,7 +197,8 @@ class MotionWorker:
             speed_factor=planner.speed_factor,
             extrude_factor=planner.extrude_factor,
             stands_from_s=self.pipeline.moved_until + self.steps.lag_s if stands else None,
-            steps_sent=tuple(self._counts().values()),
+            steps_sent=tuple(self._count(stepper) for stepper in steppers),
+            last_step_clocks=tuple(stepper.issued_clock for stepper in steppers),
             offset=planner.gcode_offset,
             figures=motion_figures(planner, self._job.machine),
             unit_mm=planner.unit_mm,
@@ -231,7 +233,10 @@ class MotionWorker:
 
     def _counts(self) -> dict[str, int]:
         """Return where the nodes will count the steppers when all that was made is executed."""
-        return {s.name: s.issued + self.began_at.get(s.name, 0) for s in self.steps.stats().steppers}
+        return {stepper.name: self._count(stepper) for stepper in self.steps.stats().steppers}
+
+    def _count(self, stepper: StepperStats) -> int:
+        return stepper.issued + self.began_at.get(stepper.name, 0)
 
     def _all_generated(self) -> bool:
         return (

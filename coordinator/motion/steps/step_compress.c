@@ -228,7 +228,6 @@ static int search(struct search *q, double clock, uint32_t expected) {
 
 static void count_segment(struct stepper *s, const struct segment *g, double worst) {
     s->stats.steps += g->count;
-    s->stats.issued += (int64_t)s->direction * g->count;
     s->stats.queue_steps++;
     if (worst > s->stats.worst_error_ticks)
         s->stats.worst_error_ticks = worst;
@@ -270,6 +269,8 @@ static void send(struct stepper *s, size_t from, struct segment *g, int64_t cloc
     g->req = g->flags & SEGMENT_RESET ? g->reset_clock : s->sent_clock;
     if (g->req < g->first - s->lead_ticks)
         g->req = g->first - s->lead_ticks;
+    if (s->direction < 0)
+        g->flags |= SEGMENT_BACK;
     if (s->sent_direction != s->direction) {
         g->flags |= SEGMENT_SET_DIR;
         if ((s->direction > 0) == (s->config.invert_dir == 0))

@@ -37,7 +37,7 @@ struct clock_map {
     int64_t whole;
 };
 
-enum { SEGMENT_SET_DIR = 1, SEGMENT_DIR_VALUE = 2, SEGMENT_RESET = 4 };
+enum { SEGMENT_SET_DIR = 1, SEGMENT_DIR_VALUE = 2, SEGMENT_RESET = 4, SEGMENT_BACK = 8 };
 
 struct segment {
     int64_t req, first, finish;

@@ -102,6 +102,8 @@ static void emit_segment(struct node *node, struct stepper *s) {
     const uint64_t min_clock = take_slot(node, node->last_req, positive(g->first), positive(g->finish));
     const int64_t values[] = {g->interval, g->count, g->add};
     emit_for(node, s, min_clock, &s->queue_step, values, 3);
+    s->stats.issued += g->flags & SEGMENT_BACK ? -(int64_t)g->count : g->count;
+    s->stats.issued_clock = g->finish;
     s->segment_head = (s->segment_head + 1) % STEP_SEGMENTS;
     s->segment_count--;
 }

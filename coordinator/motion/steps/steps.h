@@ -111,8 +111,9 @@ struct step_error {
 };
 
 struct step_stepper_stats {
-    int64_t position; // steps since init, what the last generated time asks for
-    int64_t issued;   // steps since init, what the emitted commands add up to
+    int64_t position;     // steps since init, what the last generated time asks for
+    int64_t issued;       // steps since init, what the commands in batches add up to
+    int64_t issued_clock; // the node's clock at the last of them
     uint64_t steps, queue_steps, direction_changes, commands, content_bytes;
     uint64_t cancelled, put_off; // opposite steps closer than the pulses allow, see above
     double worst_error_ticks;

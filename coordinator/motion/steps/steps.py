@@ -25,7 +25,9 @@ class StepperStats:
     position: int
     """Steps from the start, up to the generated time."""
     issued: int
-    """Steps from the start that the commands made so far add up to."""
+    """Steps from the start that the commands in batches add up to."""
+    issued_clock: int
+    """The node's 64-bit clock at the last of them; 0: there is none."""
     steps: int
     queue_steps: int
     direction_changes: int

@@ -11,6 +11,7 @@ import numpy as np
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.motion import Motion
+from coordinator.service.state.sent_commands import read_batch
 from coordinator.service.state.trace import KEEP_S, Moves
 from coordinator.support.values import Value
 from nodes.dictionary.dictionary import Dictionary
@@ -20,7 +21,6 @@ MOVES_MAX: Final = 4000
 COMMANDS_MAX: Final = 4000
 """Of each moving node."""
 _COLUMNS: Final = ("print_time", "accel_s", "cruise_s", "decel_s", "start_v", "cruise_v", "accel", "line")
-_HEADER: Final = 17
 REST: Final = 4.0
 """A dump keeps the interpreter busy for some 50 ms; for so many times as long there is no other."""
 ROWS_AT_A_TIME: Final = 50
@@ -162,23 +162,13 @@ async def _queue(
 def _newest_first(sender: _Sender, since_s: float) -> Iterator[tuple[float, int, int, int, int]]:
     """Yield print time, oid, interval, count and add of every queue_step, back to SINCE_S."""
     for batch in reversed(sender.batches):
-        for at, size in reversed(_records(batch)):
-            due_s = sender.print_time(int.from_bytes(batch[at + 8 : at + 16], "little"))
+        for due, command in reversed(read_batch(batch)):
+            due_s = sender.print_time(due)
             if due_s < since_s:
                 return
-            content = batch[at + _HEADER : at + _HEADER + size]
-            for message in sender.dictionary.decode_commands(content) or ():
+            for message in sender.dictionary.decode_commands(command) or ():
                 if message.name == "queue_step":
                     oid, interval, count, add = (
                         message.integer(name) for name in ("oid", "interval", "count", "add")
                     )
                     yield due_s, oid, interval, count, add
-
-
-def _records(batch: bytes) -> list[tuple[int, int]]:
-    """Return where each record of BATCH begins, and how long its command is (nodes/link/batch.h)."""
-    found, at = [], 0
-    while at + _HEADER <= len(batch):
-        found.append((at, batch[at + 16]))
-        at += _HEADER + batch[at + 16]
-    return found

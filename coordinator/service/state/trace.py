@@ -5,7 +5,9 @@ The motion worker adds moves, the control loop reads; both see one immutable tup
 
 import contextlib
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from coordinator.motion.planner.planner import ffi_memory
 from coordinator.motion.trapezoid_array import TRAPEZOID
+from coordinator.streaming.move_source import Planned
 
 KEEP_S: Final = 10.0
 MOVES_MAX: Final = 20_000
@@ -40,6 +43,16 @@ class Moment:
     """Of the filament, as the program has it: without pressure advance; negative: it is drawn back."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """What all commands that were sent add up to, by stepper; empty before the first."""
+
+    counts: tuple[int, ...] = ()
+    """Where its node will count it when they are executed, in steps."""
+    clocks: tuple[int, ...] = ()
+    """Its node's 64-bit clock at its last step; 0: it has none."""
+
+
 class MotionTrace:
     """A ``Witness`` that keeps what was planned and sent within the last KEEP_S, bounded in size."""
 
@@ -47,6 +60,8 @@ class MotionTrace:
         self._pieces: tuple[Moves, ...] = ()
         self._batches: list[deque[bytes]] = [deque() for _ in range(nodes)]
         self._batch_bytes = [0] * nodes
+        self._batches_seen = [0] * nodes
+        self.sent = Sent()
         self.forget_before_s = 0.0
         """Print time; set by the control loop."""
         self._fresh: deque[Moves] = deque(maxlen=FRESH_MAX)
@@ -68,13 +83,16 @@ class MotionTrace:
             del kept[0]
         self._pieces = tuple(kept)
 
-    def see_batch(self, node: int, batch: bytes) -> None:
-        """Keep the newest commands of a node."""
-        kept = self._batches[node]
-        kept.append(batch)
-        self._batch_bytes[node] += len(batch)
-        while len(kept) > 1 and self._batch_bytes[node] > BATCH_BYTES_MAX:
-            self._batch_bytes[node] -= len(kept.popleft())
+    def see_sent(self, batches: Sequence[tuple[int, bytes]], planned: Planned) -> None:
+        """Keep the newest commands of each node, and what all commands add up to."""
+        for node, batch in batches:
+            kept = self._batches[node]
+            kept.append(batch)
+            self._batches_seen[node] += 1
+            self._batch_bytes[node] += len(batch)
+            while len(kept) > 1 and self._batch_bytes[node] > BATCH_BYTES_MAX:
+                self._batch_bytes[node] -= len(kept.popleft())
+        self.sent = Sent(planned.steps_sent, planned.last_step_clocks)
 
     # --------------------------------------------------------------------------------------- to look at
 
@@ -116,6 +134,11 @@ class MotionTrace:
     def batches(self, node: int) -> tuple[bytes, ...]:
         """Return what was sent to a moving node, oldest first."""
         return tuple(self._batches[node])
+
+    def batches_after(self, node: int, seen: int) -> tuple[int, tuple[bytes, ...]]:
+        """Return how many batches a node has got, and of those beyond the first SEEN what is still kept."""
+        total, kept = self._batches_seen[node], self._batches[node]
+        return total, tuple(islice(kept, max(0, len(kept) - (total - seen)), None))
 
 
 def _end_s(move: Any) -> float:

@@ -94,6 +94,7 @@ def test_what_moonraker_and_a_browser_ask_for(tmp_path: Path) -> None:
             await _check_outputs(client)
             await _check_print(client, served, printer)
             await _check_dumps(api, client)
+            await _check_step_dumps(api, client)
             await _check_stop_and_restart(api, client, served)
             assert api.notices == []
 
@@ -185,6 +186,58 @@ def _check_rows(rows: list[Any], begin: list[float], end: list[float]) -> None:
         at = [value + way * ratio for value, ratio in zip(place, direction, strict=True)]
         before_s = time_s + duration_s
     assert at == pytest.approx(end, abs=1e-6)
+
+
+async def _check_step_dumps(api: KlippyApi, client: KlippyClient) -> None:
+    """Rows add up to the way, also for who begins to listen in the middle of a move; no clock is missing."""
+    early, late = api.connect(), api.connect()
+    ask = "motion_report/dump_stepper"
+    await early.ask(ask, {"name": "stepper_x"})
+    await client.script("G28", "G91", "G1 X0.5 F1200", "G90", "M400")
+    await early.updates(0.5)
+    said = [event["params"] for event in early.events]
+    ends_mm = [_step_rows_end_mm(params) for params in said]
+    assert ends_mm[-1] == pytest.approx(said[0]["first_position"] + 0.5, abs=0.02)
+    early.transport.close()
+    early = api.connect()
+    await client.script("G1 X20 Y20 F6000", "M400")
+    assert (await early.ask(ask, {"name": "stepper_x"}))["header"] == ["interval", "count", "add"]
+    assert "one of stepper_x, " in await client.error(ask, {"name": "toolhead"})
+    await client.script("G1 X110 F3000")
+    await client.updates(0.6)
+    await late.ask(ask, {"name": "stepper_x"})
+    await client.script("G4 P10", "G1 X60 F6000", "M400")
+    await early.updates(0.5)
+    await late.updates(0.1)
+    for watcher, begins_mm in ((early, 20 + 20), (late, None)):  # the motor turns for X + Y
+        said = [event["params"] for event in watcher.events]
+        assert begins_mm is None or said[0]["first_position"] == pytest.approx(begins_mm, abs=0.02)
+        ends_mm = [_step_rows_end_mm(params) for params in said]
+        assert ends_mm[-1] == pytest.approx(60 + 20, abs=0.02)
+        for before, after, end_mm in zip(said, said[1:], ends_mm, strict=False):
+            assert after["first_position"] == pytest.approx(end_mm, abs=1e-9)
+            assert after["first_clock"] - after["data"][0][0] == before["last_clock"]
+        ticks_per_step = [row[0] for params in said for row in params["data"] if abs(row[1]) > 100]
+        freq = (said[0]["last_clock"] - said[0]["first_clock"]) / (
+            said[0]["last_time"] - said[0]["first_time"]
+        )
+        assert min(ticks_per_step) == pytest.approx(freq * said[0]["step_distance"] / 100, rel=0.01)
+        watcher.transport.close()
+    whole = {event["params"]["last_clock"]: event["params"]["data"] for event in early.events}
+    for params in (event["params"] for event in late.events):
+        rows = params["data"]
+        assert whole[params["last_clock"]][-len(rows) :] == rows
+
+
+def _step_rows_end_mm(params: dict[str, Any]) -> float:
+    """Return where the rows of a message lead; their clocks have to lead to its last one."""
+    clock = params["first_clock"] - params["data"][0][0]
+    steps = 0
+    for interval, count, add in params["data"]:
+        clock += interval * abs(count) + add * abs(count) * (abs(count) - 1) // 2
+        steps += count
+    assert clock == params["last_clock"]
+    return float(params["first_position"] + steps * params["step_distance"])
 
 
 async def _check_mesh(client: KlippyClient) -> None:

@@ -1,11 +1,14 @@
 """Where the machine is, from the moves it was given; a numeric integral is the witness."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.motion.planner.planner import Planner
-from coordinator.service.state.trace import BATCH_BYTES_MAX, MOVES_MAX, MotionTrace
+from coordinator.service.core.motion import UNMOVED
+from coordinator.service.state.trace import BATCH_BYTES_MAX, MOVES_MAX, MotionTrace, Sent
 from coordinator.support.examples import DEMO_MACHINE
 
 
@@ -71,9 +74,15 @@ def test_memory_is_bounded_and_the_newest_stays() -> None:
     planner.flush()
     trace.see_moves(planner.take().pointer, 1)
     assert len(trace.moves(0.0)) < MOVES_MAX / 4
-    for _ in range(100):
-        trace.see_batch(0, bytes(BATCH_BYTES_MAX // 10))
+    sent = replace(UNMOVED, steps_sent=(7,), last_step_clocks=(99,))
+    for number in range(100):
+        trace.see_sent([(0, bytes([number]) * (BATCH_BYTES_MAX // 10))], sent)
     assert sum(map(len, trace.batches(0))) <= BATCH_BYTES_MAX
+    assert trace.sent == Sent((7,), (99,))
+    total, newest = trace.batches_after(0, 97)
+    assert (total, [batch[0] for batch in newest]) == (100, [97, 98, 99])
+    assert [batch[0] for batch in trace.batches_after(0, 0)[1]] == list(range(90, 100)), "what is kept"
+    assert trace.batches_after(0, 100) == (100, ())
 
 
 def test_only_the_stretch_that_is_asked_for() -> None:
