@@ -18,6 +18,7 @@ from coordinator.assembly.load import load_machine
 from coordinator.assembly.reference import reference_spec, sections
 from coordinator.config.options import SectionSpec
 from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
+from coordinator.gcode.absent_commands import ABSENT
 from nodes.support.errors import CanductorError
 
 BEGIN: Final = "<!-- The tables below are made by python -m coordinator.assembly.compared -->\n"
@@ -26,10 +27,10 @@ NO_COMMANDS: Final = frozenset(
     (
         *("NAME", "CENTER", "POLYGON", "TAPS", "TIMEOOUT", "METHOD", "FACTOR", "BAND", "STEP_DELTA"),
         *("STEP_HEIGHT", "HOME", "BAD_PROBE_STRATEGY", "BAD_PROBE_RETRIES", "RETRY_SPEED", "ENABLE"),
-        *("COMPONENT",),
+        *("COMPONENT", "O32", "STOP_ON_ENDSTOP", "PATTERN_SPACING", "TEMP_COEFF", "BELAY"),
     )
 )
-"""Parameters that the data has as commands."""
+"""Parameters and words that the data has as commands."""
 STATUS_OBJECTS: Final = {
     "heater": "extruder",
     "temperature sensors": "temperature_sensor",
@@ -41,8 +42,11 @@ READ_ELSEWHERE: Final = {"include": "acting", "constants": "absent"}
 """Sections without a specification."""
 COLUMN: Final = "run with the peer's firmware"
 FIRST_CELLS: Final = 4
-PINNED: Final = frozenset({"mcu_phase_offset", "phase_offset_position", "temperature"})
-"""Fields of a TMC driver that are there and always None."""
+NOT_KNOWN: Final = {
+    "tmc2209": frozenset({"mcu_phase_offset", "phase_offset_position", "temperature"}),
+    "temperature_sensor": frozenset({"humidity", "pressure", "gas"}),
+}
+"""Fields of what nothing here measures: None, or not there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +110,9 @@ def command_names(data: Mapping[str, Any], page: str) -> Names:
     """Return the commands of DATA, as the table of commands on PAGE has them."""
     here = dict(re.findall(r"^\| `(\w+)` \| (\w+) \|", page, re.MULTILINE))
     state = {"works": "acting", "differs": "acting", "absent": "absent"}
+    elsewhere = {name: "absent" if name in ABSENT else "unknown" for name in data}
     commands = (name for name in data if name not in NO_COMMANDS)
-    return Names.of("commands", ((name, state.get(here.get(name, ""), "unknown")) for name in commands))
+    return Names.of("commands", ((name, state.get(here.get(name, ""), elsewhere[name])) for name in commands))
 
 
 def status_names(data: Mapping[str, Iterable[str]], macros: str) -> list[Names]:
@@ -131,10 +136,10 @@ def _field_states(
         root = re.split(r"[.\[]", root)[0]
         if known is None:
             yield root, "absent" if ours in UNSUPPORTED_SECTIONS else "unknown"
-        elif root == "<variable>" or (root in known and not (ours == "tmc2209" and root in PINNED)):
-            yield root, "acting"
+        elif root in NOT_KNOWN.get(ours, ()):
+            yield root, "absent"
         else:
-            yield root, "absent" if root in known else "unknown"
+            yield root, "acting" if root == "<variable>" or root in known else "unknown"
 
 
 def _verdicts(folder: Path) -> Iterator[tuple[str, str, str]]:

@@ -116,11 +116,33 @@ _TABLE: Final[tuple[tuple[Effect, tuple[str, ...], str], ...]] = (
             "TR_HOME TR_GO_TO_LANE TR_LOAD_LANE TR_LOAD_TOOLHEAD TR_UNLOAD_TOOLHEAD TR_RESUME TR_SERVO_DOWN"
             " TR_SERVO_UP TR_SERVO_TEST TR_NEXT TR_SYNC_TO_EXTRUDER TR_UNSYNC_FROM_EXTRUDER"
             " TR_LOCATE_SELECTOR TR_CALIBRATE_SELECTOR TR_SET_ACTIVE_LANE TR_RESET_ACTIVE_LANE"
+            " TR_SET_DEFAULT_LANE TR_SET_HOTEND_LOAD_LENGTH TR_DISCARD_BOWDEN_LENGTHS TR_RESET_TOOL_MAP"
         ),
     ),
+    (Effect.NONE, ("trad_rack",), "TR_PRINT_TOOL_MAP TR_PRINT_TOOL_GROUPS"),
     (Effect.MOVES, ("tools_calibrate",), "TOOL_LOCATE_SENSOR TOOL_CALIBRATE_TOOL_OFFSET"),
+    (
+        Effect.NONE,
+        ("tools_calibrate",),
+        "TOOL_CALIBRATE_QUERY_PROBE TOOL_CALIBRATE_SAVE_TOOL_OFFSET",
+    ),
     (Effect.MOVES, ("mixing_extruder",), "M163 M164 M567 SET_MIXING_EXTRUDER SAVE_MIXING_EXTRUDERS"),
     (Effect.MOVES, ("belay",), "BELAY_ENABLE BELAY_DISABLE BELAY_SET_STEPPER"),
+    (Effect.NONE, ("belay",), "QUERY_BELAY"),
+    (Effect.MOVES, ("indx",), "INDX_EXTRUDER_MOVE INDX_DOCK_MEASURE INDX_CLEAR_FILAMENT"),
+    (
+        Effect.HEATS,
+        ("indx",),
+        "INDX_SET_PID INDX_SET_CYCLE_LIMIT INDX_MEASURE_POWER INDX_FORCE_BRACKET_TEMP",
+    ),
+    (
+        Effect.NONE,
+        ("indx",),
+        (
+            "INDX_LOG INDX_LED_SET_CURRENT INDX_DUMP_MODEL_UPDATE INDX_DEBUG_IR_SENSOR_EEPROM"
+            " INDX_DEBUG_STREAM_RAW_IR_SENSOR"
+        ),
+    ),
     (Effect.HEATS, ("heated_fan",), "SET_HEATED_FAN_TARGET"),
     (Effect.HEATS, ("heater_bed",), "M140 M190"),
     (Effect.HEATS, ("extruder",), "M104 M109"),
@@ -154,6 +176,7 @@ _TABLE: Final[tuple[tuple[Effect, tuple[str, ...], str], ...]] = (
     ),
     (Effect.NONE, ("gcode_shell_command",), "RUN_SHELL_COMMAND"),
     (Effect.NONE, ("filament_motion_sensor",), "QUERY_FILAMENT_SENSOR SET_FILAMENT_SENSOR"),
+    (Effect.NONE, (), "LOG_ROLLOVER RELOAD_GCODE_MACROS"),
 )
 
 

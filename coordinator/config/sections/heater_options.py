@@ -154,6 +154,8 @@ UNSUPPORTED_HEATER_OPTIONS: Final = (
     "pid_tolerance",
     "min_ambient_change",
     "lost_update_tolerance",
+    *("inner_sensor_name", "inner_target_temp", "inner_max_temp"),
+    *("inner_pid_kp", "inner_pid_ki", "inner_pid_kd"),
 )
 MIN_EXTRUDE_TEMP: Final = FloatOption(
     name="min_extrude_temp",

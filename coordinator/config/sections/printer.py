@@ -62,6 +62,7 @@ PRINTER = SectionSpec(
         MINIMUM_CRUISE_RATIO,
         MAX_ACCEL_TO_DECEL,
     ),
+    unsupported=("invert_kinematics", "scale_xy_accel"),
 )
 
 
@@ -83,7 +84,7 @@ def open_printer(section: RawSection) -> tuple[str, SectionReader]:
     names = {
         k: (*spec.unsupported, *(option.name for option in spec.options)) for k, spec in PRINTER_SPECS.items()
     }
-    every = tuple({name: None for owned in names.values() for name in owned})
+    every = tuple({name: None for owned in (PRINTER.unsupported, *names.values()) for name in owned})
     kinematics = SectionReader(section, SectionSpec(PRINTER.help, PRINTER.options, every)).get(KINEMATICS)
     for name, option in section.options.items():
         owners = [owner for owner, owned in names.items() if name in owned]
@@ -94,7 +95,8 @@ def open_printer(section: RawSection) -> tuple[str, SectionReader]:
                 f" machine is {kinematics}; remove it",
             )
     own = PRINTER_SPECS.get(kinematics, SectionSpec("", ()))
-    spec = SectionSpec(PRINTER.help, (*PRINTER.options, *own.options), own.unsupported)
+    unsupported = (*PRINTER.unsupported, *own.unsupported)
+    spec = SectionSpec(PRINTER.help, (*PRINTER.options, *own.options), unsupported)
     reader = SectionReader(section, spec)
     reader.get(KINEMATICS)
     return kinematics, reader
