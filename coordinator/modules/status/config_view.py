@@ -56,6 +56,12 @@ def _plain(value: object) -> object:
 
 
 _COUNTS: Final = frozenset(("probe_count", "mesh_pps"))
+_WHOLE_NUMBERS: Final = re.compile(
+    r"\w*(count|samples|retries|microsteps|_steps|_pps|_ppr|_address|_len)|x_count|y_count|driver_\w+|chain_\w+"
+    r"|baud|full_steps_per_rotation|spi_speed|i2c_speed|rate|version|contrast|menu_timeout|idle_current_percent"
+    r"|encoder_steps_per_detent|oversample_\w+|iir_filter"
+)
+"""Options without a reader of their own whose numbers are whole; all others are decimal numbers."""
 _LISTS: Final = _COUNTS | frozenset(
     (
         *("mesh_min", "mesh_max", "mesh_origin", "zero_reference_position"),
@@ -82,8 +88,8 @@ def _typed(section: str, option: str, text: str) -> object:
     if option in _WORDS:
         return [word.strip() for word in text.split(",") if word.strip()]
     if option not in _LISTS:
-        return _guess(text)
-    number = _guess if option in _COUNTS else _decimal
+        return _guess(text, whole=_WHOLE_NUMBERS.fullmatch(option) is not None)
+    number = _whole if option in _COUNTS else _decimal
     lines = [[number(word) for word in line.split(",")] for line in text.split("\n") if line.strip()]
     found: object = lines[0] if len(lines) == 1 else lines
     if option == "probe_count" and isinstance(found, list) and len(found) == 1:
@@ -97,13 +103,16 @@ def _decimal(text: str) -> object:
     return text if value is None else value
 
 
-def _guess(text: str) -> object:
-    """Return the value that TEXT looks like: a number, a truth value, else the text."""
+def _whole(text: str) -> object:
+    """Return the whole number TEXT, else the decimal number, else the text."""
+    return int(text) if _WHOLE.fullmatch(text.strip()) else _decimal(text)
+
+
+def _guess(text: str, *, whole: bool) -> object:
+    """Return the value that TEXT looks like: a number, WHOLE if it can be, a truth value, else the text."""
     word = text.strip()
     if word.lower() in ("true", "yes", "on"):
         return True
     if word.lower() in ("false", "no", "off"):
         return False
-    if _WHOLE.fullmatch(word):
-        return int(word)
-    return _decimal(text)
+    return _whole(text) if whole else _decimal(text)

@@ -55,6 +55,10 @@ screw3: 90,180
 [servo door]
 pin: 13
 maximum_servo_angle: 90
+[tmc5160 stepper_x]
+cs_pin: PA9
+run_current: 1
+driver_TBL: 2
 [adxl345]
 cs_pin: 5
 axes_map: x,-y, z
@@ -95,7 +99,8 @@ WANTED: dict[str, dict[str, Any]] = {
     "idle_timeout": {"timeout": 300.0},
     "force_move": {"enable_force_move": True},
     "screws_tilt_adjust": {"screw1": [10.0, 20.0], "screw1_name": "7"},
-    "servo door": {"pin": "13", "maximum_servo_angle": 90},
+    "servo door": {"pin": "13", "maximum_servo_angle": 90.0},
+    "tmc5160 stepper_x": {"run_current": 1.0, "driver_tbl": 2},
     "adxl345": {"cs_pin": "5", "axes_map": ["x", "-y", "z"], "rate": 3200},
     "gcode_macro park": {"description": "on", "variable_x": "5"},
     "mcu": {"canbus_uuid": "11aa22bb33cc"},
