@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Final, Protocol
 
-from coordinator.dnc.blocks import INPUT, OUTPUT, Header
 from coordinator.dnc.driver import Driver, Line
 from coordinator.dnc.endpoint import Endpoint, FileSource, Library, Outcome, Sink, Source, Take
-from coordinator.dnc.engine import Engine
 from coordinator.dnc.feeds import SlowSource
 from coordinator.dnc.files import Check, Entry, Folder, check_lines, check_name
 from coordinator.dnc.job import DncJob
 from coordinator.dnc.machine import MachineSink
-from coordinator.dnc.numbers import numbered
 from coordinator.dnc.options import DncOptions
 from coordinator.dnc.port import Port
+from coordinator.dnc.protocol.blocks import INPUT, OUTPUT, Header
+from coordinator.dnc.protocol.engine import Engine
+from coordinator.dnc.protocol.numbers import numbered
 from coordinator.dnc.tables import check_table
 from coordinator.dnc.verify import Compare, TwoPassFolder
 from coordinator.ipc.client.blocking import BlockingClient

@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable
 from typing import Final, Protocol
 
-from coordinator.dnc.engine import Engine, State
-from coordinator.dnc.events import Event
+from coordinator.dnc.protocol.engine import Engine, State
+from coordinator.dnc.protocol.events import Event
 
 UNREADABLE_MIN: Final = 8
 """Received characters without a header after which ON_UNREADABLE is called."""

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import IO, Final, Protocol
 
-from coordinator.dnc import events
-from coordinator.dnc.blocks import INPUT, Header
-from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.files import FileRefused, Folder, check_lines, read_lines
-from coordinator.dnc.listing import Listing, read_listing, write_listing
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.blocks import INPUT, Header
+from coordinator.dnc.protocol.engine import Engine, State
+from coordinator.dnc.protocol.listing import Listing, read_listing, write_listing
 from nodes.support.errors import CanductorError
 
 

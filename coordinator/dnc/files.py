@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
-from coordinator.dnc.blocks import BadText, is_text
+from coordinator.dnc.protocol.blocks import BadText, is_text
 from coordinator.support.atomic_file import claim, remove_unfinished
 from nodes.support.errors import CanductorError
 

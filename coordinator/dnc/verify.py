@@ -6,9 +6,9 @@ detected in one transfer. In two transfers the same damage would have to occur a
 
 from typing import IO
 
-from coordinator.dnc.blocks import Header
 from coordinator.dnc.endpoint import Sink
 from coordinator.dnc.files import FileRefused, Folder, Incoming, read_lines, stored_name
+from coordinator.dnc.protocol.blocks import Header
 
 _TEXT = "NOT THE SAME"
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Linear delta: a carriage on a vertical tower, an arm from it to the head. Params: arm², tower x, tower y.
-#include "coordinator/motion/steps/step_formula.h"
+#include "coordinator/motion/steps/times/step_formula.h"
 
 static double position(const double *q, double near, const double *p, const double *v, double *speed) {
     (void)near;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Deltesian: a carriage on a vertical tower in the X Z plane, an arm from it to the head. Params: arm², tower
 // x.
-#include "coordinator/motion/steps/step_formula.h"
+#include "coordinator/motion/steps/times/step_formula.h"
 
 static double position(const double *q, double near, const double *p, const double *v, double *speed) {
     (void)near;

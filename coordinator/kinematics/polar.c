@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Polar: a turning bed and an arm over its middle.
-#include "coordinator/motion/steps/step_formula.h"
+#include "coordinator/motion/steps/times/step_formula.h"
 
 static const double TURN = 6.283185307179586476925286766559;
 

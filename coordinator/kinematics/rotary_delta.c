@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Rotary delta: a shoulder turns the upper arm, the lower one leads from its elbow to the head.
-#include "coordinator/motion/steps/step_formula.h"
+#include "coordinator/motion/steps/times/step_formula.h"
 
 // Params: upper arm U, lower arm L, shoulder's radius R and height H, cosine and sine of its direction. The
 // elbow (R + U·cos θ, H + U·sin θ) is L away from the head; the speed is that equation's derivative.

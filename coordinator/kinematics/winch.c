@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Winch: a cable from its anchor to the head. Params: the anchor x, y, z.
-#include "coordinator/motion/steps/step_formula.h"
+#include "coordinator/motion/steps/times/step_formula.h"
 
 static double position(const double *q, double near, const double *p, const double *v, double *speed) {
     (void)near;

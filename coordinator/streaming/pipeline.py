@@ -33,7 +33,7 @@ from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import MoveSource
 
 BatchSink = Callable[[int, bytes], None]
-"""Takes a node's index and a piece of its stream (nodes/link/batch.h)."""
+"""Takes a node's index and a piece of its stream (nodes/link/core/batch.h)."""
 
 MoveWatch = Callable[[Any, int], None]
 """Takes a pointer to trapezoids, and how many there are, as they go to step generation."""

@@ -1,4 +1,7 @@
-"""Links: reliable, ordered command streams to nodes, and the I/O thread of the bus they share."""
+"""Links: reliable, ordered command streams to nodes, and the I/O thread of the bus they share.
+
+In C: ``core/`` has a link and the schedule of a bus, ``io/`` the bus with all its links and its thread.
+"""
 
 from nodes.link.bus_io import LinkIO
 from nodes.link.link import Link

@@ -10,6 +10,6 @@ from nodes.support.native_build import builder
 
 ffibuilder = builder(
     "nodes.link._link",
-    headers=[*CORE_HEADERS, "nodes/link/io_thread.h"],
-    sources=[*CORE_SOURCES, "nodes/link/io_thread.c"],
+    headers=[*CORE_HEADERS, "nodes/link/io/io_thread.h"],
+    sources=[*CORE_SOURCES, "nodes/link/io/io_thread.c"],
 )

@@ -166,7 +166,7 @@ class Node:
     # ---------------------------------------------------------------------------------------------- messages
 
     def send(self, name: str, /, *, min_clock: int = 0, req_clock: int = 0, **args: Value | str) -> None:
-        """Send a command (clocks: ``nodes/link/batch.h``); NodeError when the node cannot take it."""
+        """Send a command (clocks: ``nodes/link/core/batch.h``); NodeError when the node cannot take it."""
         self._check_usable()
         self._talk.send(name, min_clock=min_clock, req_clock=req_clock, **args)
 

@@ -138,7 +138,7 @@ class RequestReply:
     # ------------------------------------------------------------------------------------------------ send
 
     def send(self, name: str, /, *, min_clock: int = 0, req_clock: int = 0, **args: Value | str) -> None:
-        """Send a command; clocks as in ``nodes/link/batch.h``. Raises MessageError."""
+        """Send a command; clocks as in ``nodes/link/core/batch.h``. Raises MessageError."""
         self.link.send(self.encode(name, **args), min_clock=min_clock, req_clock=req_clock)
 
     def send_text(self, command: str) -> None:

@@ -1,9 +1,9 @@
 """What the fuzzers of BCC run: any bytes for either role, in any pieces, at any times."""
 
-from coordinator.dnc import events
-from coordinator.dnc.blocks import DIRECTORY_REQUEST, SOH, STX, BadText, write_block
-from coordinator.dnc.engine import DIRECTORY_MAX, Engine, State
 from coordinator.dnc.options import DncOptions, read_frame
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.blocks import DIRECTORY_REQUEST, SOH, STX, BadText, write_block
+from coordinator.dnc.protocol.engine import DIRECTORY_MAX, Engine, State
 
 OPTIONS = tuple(
     DncOptions(

@@ -8,7 +8,7 @@
 // the emitted commands must stay in the machine.
 #include "coordinator/motion/planner/gcode_lines.h"
 #include "coordinator/motion/steps/steps.h"
-#include "nodes/link/batch.h"
+#include "nodes/link/core/batch.h"
 #include "wire/wire.h"
 #include <math.h>
 #include <stdio.h>

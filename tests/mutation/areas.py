@@ -10,7 +10,7 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
     "core": ("firmware/core/*.[ch]",),
     "objects": ("firmware/objects/*.[ch]",),
     "net": ("firmware/net/*.[ch]",),
-    "link": ("nodes/link/*.c", "nodes/link/*.h", "nodes/link/*.py"),
+    "link": ("nodes/link/*/*.[ch]", "nodes/link/*.py"),
     "clock": ("nodes/clock/*.py", "nodes/node/clock_keeper.py"),
     "homing": (
         "coordinator/runtime/moves/homing.py",

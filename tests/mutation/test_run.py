@@ -66,7 +66,7 @@ def test_tests_run_in_the_order_in_which_they_promise_to_fail() -> None:
 
 
 def verdicts(**outcomes: int) -> list[run.Verdict]:
-    file = "nodes/link/link.c"
+    file = "nodes/link/core/link.c"
     return [
         run.Verdict(mutation(file), outcome.replace("_", " "))
         for outcome, count in outcomes.items()

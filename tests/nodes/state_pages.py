@@ -59,7 +59,7 @@ def link_page() -> str:
     )
     states = (f"* **{state.name}**: {words}" for state, words in STATE_WORDS.items())
     return _page(
-        "link", "nodes/link/link_states.c", states=states, arrows=arrows, first="PROBING", last="LOST"
+        "link", "nodes/link/core/link_states.c", states=states, arrows=arrows, first="PROBING", last="LOST"
     )
 
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // See plan_stats.h.
 #include "coordinator/motion/stats/plan_stats.h"
-#include "nodes/link/batch.h"
+#include "nodes/link/core/batch.h"
 #include "nodes/support/can_bits.h"
 #include "wire/wire.h"
 

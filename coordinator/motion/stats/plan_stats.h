@@ -70,8 +70,8 @@ int plan_stats_init(struct plan_stats *stats, const struct plan_node *nodes, int
 
 void plan_stats_moves(struct plan_stats *stats, const struct trapezoid *moves, size_t count);
 
-// Counts whole records of a node's batch (nodes/link/batch.h). A record that is cut short or makes no sense
-// is counted as bad.
+// Counts whole records of a node's batch (nodes/link/core/batch.h). A record that is cut short or makes no
+// sense is counted as bad.
 void plan_stats_batch(struct plan_stats *stats, int node, const uint8_t *batch, size_t size);
 
 // Sends the blocks that are not full yet. Call it once, after the last batch.

@@ -14,7 +14,7 @@ ffibuilder = builder(
         *sorted(
             str(source.relative_to(ROOT))
             for folder in ("coordinator/motion/steps", "coordinator/kinematics")
-            for source in (ROOT / folder).glob("*.c")
+            for source in (ROOT / folder).rglob("*.c")
             if not source.name.startswith("_")
         ),
         "firmware/wire/vlq.c",

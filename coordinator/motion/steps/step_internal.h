@@ -3,10 +3,10 @@
 #ifndef MOTION_STEP_INTERNAL_H
 #define MOTION_STEP_INTERNAL_H
 
-#include "coordinator/motion/steps/step_formula.h"
-#include "coordinator/motion/steps/step_surface.h"
-#include "coordinator/motion/steps/step_table.h"
 #include "coordinator/motion/steps/steps.h"
+#include "coordinator/motion/steps/times/step_formula.h"
+#include "coordinator/motion/steps/times/step_surface.h"
+#include "coordinator/motion/steps/times/step_table.h"
 
 #include <math.h>
 #include <stdbool.h>

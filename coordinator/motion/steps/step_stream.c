@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Segments into each node's stream: commands encoded, merged by req_clock, held until a queue slot is free.
 #include "coordinator/motion/steps/step_internal.h"
-#include "nodes/link/batch.h"
+#include "nodes/link/core/batch.h"
 #include "wire/wire.h"
 
 enum { ROOM_PER_SEGMENT = COMMANDS_PER_SEGMENT * (BATCH_HEADER + PREFIX_MAX + 3 * WIRE_VLQ_MAX) };

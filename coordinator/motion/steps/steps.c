@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The generator as a whole: memory, moves in, time forward.
-#include "coordinator/motion/steps/step_arithmetic.h"
+#include "coordinator/motion/steps/compression/step_arithmetic.h"
 #include "coordinator/motion/steps/step_change.h"
 
 #include <string.h>

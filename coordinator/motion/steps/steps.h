@@ -216,7 +216,8 @@ double step_look_ahead(const struct step_gen *gen);
 // How long (s) after the last move's end steps may still come.
 double step_lag(const struct step_gen *gen);
 
-// Copies whole records of NODE's batch (nodes/link/batch.h) to OUT and removes them; returns their bytes.
+// Copies whole records of NODE's batch (nodes/link/core/batch.h) to OUT and removes them; returns their
+// bytes.
 size_t step_take_batch(struct step_gen *gen, int node, uint8_t *out, size_t room);
 
 void step_stepper_stats(const struct step_gen *gen, int stepper, struct step_stepper_stats *out);

@@ -143,7 +143,7 @@ class StepGenerator:
         return bool(status == lib.STEP_OK)
 
     def take_batch(self, node: int, room: int = 1 << 16) -> bytes:
-        """Remove and return up to ROOM bytes of NODE's batch (nodes/link/batch.h), whole records only."""
+        """Remove and return up to ROOM bytes of NODE's batch (link/core/batch.h), whole records only."""
         self._check_node(node)
         out = ffi.new("uint8_t[]", room)
         taken = lib.step_take_batch(self._gen, node, out, room)

@@ -1,4 +1,4 @@
-"""Reading what was sent to nodes: the records of batches (nodes/link/batch.h)."""
+"""Reading what was sent to nodes: the records of batches (nodes/link/core/batch.h)."""
 
 from collections.abc import Sequence
 from typing import Final

@@ -3,7 +3,7 @@
 #ifndef WORLD_PARTS_H
 #define WORLD_PARTS_H
 
-#include "nodes/link/io_api.h"
+#include "nodes/link/io/io_api.h"
 #include "nodes/virtual/world/clock.h"
 #include "nodes/virtual/world/world.h"
 

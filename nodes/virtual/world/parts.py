@@ -187,7 +187,7 @@ class UartPort(Port):
 
 
 class SimDriver:
-    """Driver of one bus inside the world; its interface is described in nodes/link/io_core.h."""
+    """Driver of one bus inside the world; its interface is described in nodes/link/io/io_core.h."""
 
     def __init__(self, world: "World", raw: Any, bus: Any, name: str, *, serial: bool) -> None:
         self.name = name

@@ -16,7 +16,7 @@
 #include <stdint.h>
 
 #include "boards/sim/sim.h"
-#include "nodes/link/io_core.h"
+#include "nodes/link/io/io_core.h"
 #include "nodes/virtual/world/can_wire.h"
 
 // cffi: begin

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from coordinator.dnc import events
-from coordinator.dnc.blocks import ACK, SOH, STX, write_block
-from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.options import DncOptions
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.blocks import ACK, SOH, STX, write_block
+from coordinator.dnc.protocol.engine import Engine, State
 
 
 class Bench:

@@ -14,10 +14,10 @@ import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from coordinator.dnc import events
-from coordinator.dnc.blocks import ACK, DC1, DC3, EOT, ETB, ETX, NAK, SOH, STX
-from coordinator.dnc.engine import Engine
 from coordinator.dnc.options import DncOptions, read_frame
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.blocks import ACK, DC1, DC3, EOT, ETB, ETX, NAK, SOH, STX
+from coordinator.dnc.protocol.engine import Engine
 from tests.coordinator.dnc.line import Faults, Line, Owner, Wire
 
 LINES = (b"X1", b"X1", b"", b"Y7")

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from coordinator.dnc import events
-from coordinator.dnc.blocks import ACK, EOT, ETX, NAK, SOH, STX, Header
-from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.options import DncOptions
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.blocks import ACK, EOT, ETX, NAK, SOH, STX, Header
+from coordinator.dnc.protocol.engine import Engine, State
 
 LIMIT_S = 100_000.0
 

@@ -13,9 +13,9 @@ import random
 import sys
 from dataclasses import dataclass
 
-from coordinator.dnc import events
-from coordinator.dnc.engine import Engine
 from coordinator.dnc.options import DncOptions, read_frame
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.engine import Engine
 from tests.coordinator.dnc.line import Faults, Line, Owner, Wire
 
 FRAMES = ("7E1", "7O1", "8N1", "8E1", "7N2", "8N2")

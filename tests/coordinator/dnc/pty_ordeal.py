@@ -12,8 +12,8 @@ import time
 from dataclasses import replace
 
 from coordinator.dnc.driver import Driver
-from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.port import Port
+from coordinator.dnc.protocol.engine import Engine, State
 from tests.coordinator.dnc.cable import Cable
 from tests.coordinator.dnc.line import Owner, Wire
 from tests.coordinator.dnc.ordeal import Case, Verdict, make_case, verdict_of

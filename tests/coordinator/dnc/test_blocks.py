@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.dnc.blocks import (
+from coordinator.dnc.protocol.blocks import (
     INPUT,
     OUTPUT,
     SOH,

@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
-from coordinator.dnc import events
-from coordinator.dnc.blocks import ACK, DIRECTORY_REQUEST, EOT, NAK, SOH, write_block
 from coordinator.dnc.files import Entry
-from coordinator.dnc.listing import read_listing, write_listing
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.blocks import ACK, DIRECTORY_REQUEST, EOT, NAK, SOH, write_block
+from coordinator.dnc.protocol.listing import read_listing, write_listing
 from nodes.support.errors import CanductorError
 from tests.coordinator.dnc.bench import Bench
 

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.dnc import events
-from coordinator.dnc.blocks import ACK, DIRECTORY_REQUEST, EOT, SOH, write_block
 from coordinator.dnc.commands import _sentence
 from coordinator.dnc.endpoint import Endpoint, Library, Outcome
-from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.files import Folder
-from coordinator.dnc.listing import read_listing
 from coordinator.dnc.options import DncOptions
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.blocks import ACK, DIRECTORY_REQUEST, EOT, SOH, write_block
+from coordinator.dnc.protocol.engine import Engine, State
+from coordinator.dnc.protocol.listing import read_listing
 from coordinator.dnc.tables import check_table
 from tests.coordinator.dnc.line import Faults, Line, Owner, Wire
 

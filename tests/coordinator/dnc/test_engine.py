@@ -4,8 +4,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.dnc import events
-from coordinator.dnc.blocks import (
+from coordinator.dnc.options import DncOptions, SerialFrame
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.blocks import (
     ACK,
     DIRECTORY_REQUEST,
     EOT,
@@ -17,8 +18,7 @@ from coordinator.dnc.blocks import (
     Header,
     write_block,
 )
-from coordinator.dnc.engine import State
-from coordinator.dnc.options import DncOptions, SerialFrame
+from coordinator.dnc.protocol.engine import State
 from nodes.support.errors import CanductorError
 from tests.coordinator.dnc.bench import Bench, block, receiving, sending, take
 

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.dnc.blocks import BadText
 from coordinator.dnc.files import (
     CHECKED_MAX,
     FileRefused,
@@ -14,6 +13,7 @@ from coordinator.dnc.files import (
     read_lines,
     stored_name,
 )
+from coordinator.dnc.protocol.blocks import BadText
 from coordinator.dnc.tables import check_table
 from nodes.support.errors import CanductorError
 

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.dnc import events
-from coordinator.dnc.blocks import SOH, STX, Header, block_check, write_block
-from coordinator.dnc.engine import Engine
-from coordinator.dnc.lexer import Lexer
 from coordinator.dnc.options import DncOptions, read_frame
-from coordinator.dnc.tokens import Kind
+from coordinator.dnc.protocol import events
+from coordinator.dnc.protocol.blocks import SOH, STX, Header, block_check, write_block
+from coordinator.dnc.protocol.engine import Engine
+from coordinator.dnc.protocol.lexer import Lexer
+from coordinator.dnc.protocol.tokens import Kind
 from tests.coordinator.dnc import literal
 from tests.coordinator.dnc.line import Faults, Line, Owner, Wire
 from tests.profiles import examples

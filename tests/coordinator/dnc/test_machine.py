@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from coordinator.dnc.blocks import SOH, STX, write_block
 from coordinator.dnc.endpoint import Endpoint
-from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.files import FileRefused
 from coordinator.dnc.machine import LINES_MAX, MachineSink
 from coordinator.dnc.options import DncOptions
+from coordinator.dnc.protocol.blocks import SOH, STX, write_block
+from coordinator.dnc.protocol.engine import Engine, State
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
 from coordinator.ipc.server.uploads import upload_method
 from coordinator.support.values import Value

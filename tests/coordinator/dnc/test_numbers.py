@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.dnc.blocks import Header
 from coordinator.dnc.files import FileRefused, Folder
-from coordinator.dnc.numbers import LineNumbers, numbered
+from coordinator.dnc.protocol.blocks import Header
+from coordinator.dnc.protocol.numbers import LineNumbers, numbered
 
 DIALOG = (
     "0 BEGIN PGM 15 MM",

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.dnc.blocks import Header
 from coordinator.dnc.files import FileRefused, Folder
+from coordinator.dnc.protocol.blocks import Header
 from coordinator.dnc.verify import Compare, TwoPassFolder
 from tests.coordinator.dnc.ordeal import judge_twice, make_case
 from tests.coordinator.dnc.virtual_cable import PROGRAM, VirtualCable

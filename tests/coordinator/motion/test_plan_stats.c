@@ -3,7 +3,7 @@
 // sources: firmware/wire/block.c
 // Plan statistics: peaks, bins and their merging, frames and their bits.
 #include "coordinator/motion/stats/plan_stats.h"
-#include "nodes/link/batch.h"
+#include "nodes/link/core/batch.h"
 #include "nodes/support/can_bits.h"
 #include "tests/check.h"
 #include "wire/wire.h"

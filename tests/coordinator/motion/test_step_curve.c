@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: coordinator/motion/steps/step*.c coordinator/kinematics/*.c firmware/wire/vlq.c
+// sources: coordinator/motion/steps/step*.c coordinator/motion/steps/*/*.c coordinator/kinematics/*.c
+// sources: firmware/wire/vlq.c
 // Shaped, smoothed and non-linear steppers under the sanitizers: many moves without drift, changes at rest.
 #include "coordinator/motion/steps/steps.h"
 #include "tests/check.h"

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: coordinator/motion/steps/step*.c coordinator/kinematics/*.c firmware/wire/vlq.c
+// sources: coordinator/motion/steps/step*.c coordinator/motion/steps/*/*.c coordinator/kinematics/*.c
+// sources: firmware/wire/vlq.c
 // What step generation refuses, and that a refused call changes nothing.
 #include "coordinator/motion/steps/steps.h"
 #include "tests/check.h"

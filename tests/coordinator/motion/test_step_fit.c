@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: coordinator/motion/steps/step_arithmetic.c coordinator/motion/steps/step_fit.c
-// sources: coordinator/motion/steps/step_bands.c
+// sources: coordinator/motion/steps/compression/step_arithmetic.c
+// sources: coordinator/motion/steps/compression/step_fit.c
+// sources: coordinator/motion/steps/compression/step_bands.c
 // The fit against trying every add and interval, and the processor's
 // own arithmetic against the baseline.
-#include "coordinator/motion/steps/step_arithmetic.h"
+#include "coordinator/motion/steps/compression/step_arithmetic.h"
 #include "tests/check.h"
 
 #include <math.h>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: coordinator/motion/steps/step_table.c
+// sources: coordinator/motion/steps/times/step_table.c
 // Moves cut at the points of tables: the pieces join, last as long as the move, and end where the table says.
-#include "coordinator/motion/steps/step_table.h"
+#include "coordinator/motion/steps/times/step_table.h"
 #include "tests/check.h"
 
 #include <math.h>

@@ -6,7 +6,7 @@
 #include <linux/can.h>
 #include <string.h>
 
-#include "nodes/link/io_api.h"
+#include "nodes/link/io/io_api.h"
 #include "nodes/support/can_bits.h"
 #include "tests/check.h"
 

@@ -1,4 +1,4 @@
-"""One link as plain lists: the rules of nodes/link/link.h, written from its text, to set beside the C code.
+"""One link as plain lists: the rules of nodes/link/core/link.h, written from its text, to compare with it.
 
 Queues are lists of commands, blocks in flight a dictionary, received bytes one string. Nothing is packed, no
 state is kept that could be computed. Times are host ns, clocks node ticks.

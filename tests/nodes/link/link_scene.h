@@ -5,8 +5,8 @@
 
 #include <string.h>
 
-#include "nodes/link/batch.h"
-#include "nodes/link/link.h"
+#include "nodes/link/core/batch.h"
+#include "nodes/link/core/link.h"
 #include "tests/check.h"
 
 #define MS 1000000ULL

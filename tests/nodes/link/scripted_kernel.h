@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // The kernel under a bus's I/O thread, by script: clock, descriptors, mutex and sleep. Thread and test take
 // turns, exactly one of them runs at any moment, and time passes only when the test says so: each call can be
-// counted and each timeout compared to the nanosecond. Include it before nodes/link/io_thread.c, whose calls
-// it takes; io_thread.c is no source of the program then.
+// counted and each timeout compared to the nanosecond. Include it before nodes/link/io/io_thread.c, whose
+// calls it takes; io_thread.c is no source of the program then.
 #ifndef SCRIPTED_KERNEL_H
 #define SCRIPTED_KERNEL_H
 

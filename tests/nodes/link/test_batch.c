@@ -2,7 +2,7 @@
 // The records of a batch, byte by byte: as Python and the motion engine write them, too.
 #include <stdlib.h>
 
-#include "nodes/link/batch.h"
+#include "nodes/link/core/batch.h"
 #include "tests/check.h"
 
 enum { PAYLOAD = 5, WHOLE = 8 + 8 + 1 + PAYLOAD };

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/link/io/*.c nodes/support/can_bits.c
 // The forecast of motion to the bit and the nanosecond: how commands are grouped, which bin they fall into,
 // which stretch of time is the tightest. A serial line of 1 Mbit/s whose content costs 10 bits a byte: a byte
 // lasts 10 µs, 1000 bytes last one bin. The node's clock ticks once a µs.
 #include <math.h>
 #include <string.h>
 
-#include "nodes/link/batch.h"
-#include "nodes/link/io_bus.h"
+#include "nodes/link/core/batch.h"
+#include "nodes/link/io/io_bus.h"
 #include "tests/check.h"
 
 #define US 1000ULL

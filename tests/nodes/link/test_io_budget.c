@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/link/io/*.c nodes/support/can_bits.c
 // What a bus lets go at once, what it holds back and until when, and to which class each bit is counted: to
 // the bit and the nanosecond.
-#include "nodes/link/batch.h"
+#include "nodes/link/core/batch.h"
 #include "tests/nodes/link/bus_scene.h"
 
 enum {

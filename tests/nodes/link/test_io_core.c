@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/link/io/*.c nodes/support/can_bits.c
 // A bus without I/O, in virtual time: what it refuses, what it does with broken frames, and its end.
 #include <errno.h>
 #include <linux/can.h>
 #include <string.h>
 
-#include "nodes/link/io_api.h"
+#include "nodes/link/io/io_api.h"
 #include "tests/check.h"
 
 enum { NODE = 4, TO_PYTHON_ID = 0x3F1 };

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/link/io/*.c nodes/support/can_bits.c
 // The links of a bus: as many as there may be, opened and closed in any order, and what each call on one of
 // them takes, refuses and shows at once.
 #include <linux/can.h>
 #include <string.h>
 
-#include "nodes/link/batch.h"
-#include "nodes/link/io_api.h"
+#include "nodes/link/core/batch.h"
+#include "nodes/link/io/io_api.h"
 #include "tests/check.h"
 
 #define MS 1000000ULL

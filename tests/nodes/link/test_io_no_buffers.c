@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/link/io/*.c nodes/support/can_bits.c
 // SocketCAN's ENOBUFS: a full interface queue costs time, no frame and no busy loop. The kernels of build
 // machines have no CAN, so the one call that tells it is replaced: this file's write() refuses first.
 #define _GNU_SOURCE
@@ -14,7 +14,7 @@
 #include <sys/syscall.h>
 
 #include "bench/acker.h"
-#include "nodes/link/io_thread.h"
+#include "nodes/link/io/io_thread.h"
 
 enum { REFUSALS = 200, QUERIES = 50 };
 

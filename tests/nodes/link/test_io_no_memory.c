@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-hj-z]*.c nodes/support/can_bits.c
-// sources: nodes/link/io_[fr]*.c nodes/link/io_s[ct]*.c nodes/link/io_send.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/support/can_bits.c
+// sources: nodes/link/io/io_[fr]*.c nodes/link/io/io_s[ct]*.c nodes/link/io/io_send.c
 // A computer without memory: what cannot be made is refused, and nothing is left behind (the sanitizer sees
 // it).
 #include <stdlib.h>
@@ -14,8 +14,8 @@ static void *scarce_calloc(size_t count, size_t size) {
 }
 
 #define calloc scarce_calloc
-#include "nodes/link/io_core.c"
-#include "nodes/link/io_links.c"
+#include "nodes/link/io/io_core.c"
+#include "nodes/link/io/io_links.c"
 
 static uint64_t now_of(void *context) {
     (void)context;

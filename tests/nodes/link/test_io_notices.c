@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/link/io/*.c nodes/support/can_bits.c
 // What waits for the program that uses a bus: in which order it is handed over, whatever room there is, when
 // the driver says so, and that the counters keep up.
 #include <errno.h>
 #include <linux/can.h>
 #include <string.h>
 
-#include "nodes/link/io_api.h"
+#include "nodes/link/io/io_api.h"
 #include "tests/check.h"
 
 #define MS 1000000ULL

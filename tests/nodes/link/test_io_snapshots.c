@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-hj-z]*.c nodes/support/can_bits.c
-// sources: nodes/link/io_[cflr]*.c nodes/link/io_se*.c nodes/link/io_sc*.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/support/can_bits.c
+// sources: nodes/link/io/io_[cflr]*.c nodes/link/io/io_se*.c nodes/link/io/io_sc*.c
 // Counters are read while they are written, and a link's place goes to another link meanwhile: whatever
 // happens between two words that a reader copies, what it gets belongs together. One thread plays both.
 #include <linux/can.h>
@@ -30,7 +30,7 @@ static void note_store(const void *at, uint64_t value) {
         note_store((at), value_);                                                                            \
         __atomic_store_n((at), value_, order);                                                               \
     } while (0)
-#include "nodes/link/io_stats.c"
+#include "nodes/link/io/io_stats.c"
 
 #define MS 1000000ULL
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/link/io/*.c nodes/support/can_bits.c
 // The thread of a bus between several calling threads and a node that answers as fast as it can. Also built
 // by hand with -fsanitize=thread: what the mutex guards, it guards.
 #include "tests/check.h"
@@ -10,8 +10,8 @@
 #include <sys/socket.h>
 
 #include "bench/acker.h"
-#include "nodes/link/batch.h"
-#include "nodes/link/io_thread.h"
+#include "nodes/link/core/batch.h"
+#include "nodes/link/io/io_thread.h"
 
 enum { CALLERS = 3, COMMANDS = 3000, NODE = 4 };
 

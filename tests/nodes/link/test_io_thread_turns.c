@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-hj-z]*.c nodes/link/io_[a-su-z]*.c nodes/support/can_bits.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/link/io/io_[a-su-z]*.c nodes/support/can_bits.c
 // What the thread of a bus asks of the kernel, call by call, whatever the kernel answers.
 #define _GNU_SOURCE
 #include "tests/nodes/link/scripted_kernel.h"
 
-#include "nodes/link/io_thread.c" // its calls of the kernel go to the script
+#include "nodes/link/io/io_thread.c" // its calls of the kernel go to the script
 
 #define MS 1000000ULL
 

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/core/link*.c nodes/link/core/queue.c
 // The link against bytes and calls that make no sense: nothing faults, nothing is unbounded, time goes on.
 #include "tests/check.h"
 
 #include <math.h>
 #include <string.h>
 
-#include "nodes/link/batch.h"
-#include "nodes/link/link.h"
+#include "nodes/link/core/batch.h"
+#include "nodes/link/core/link.h"
 
 static uint8_t control_memory[512], motion_memory[2048], bulk_memory[1024];
 

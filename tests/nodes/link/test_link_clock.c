@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/core/link*.c nodes/link/core/queue.c
 // A node's clock: what it says of host time, and when commands may and should go by it.
 #include <math.h>
 
-#include "nodes/link/link_core.h"
+#include "nodes/link/core/link_core.h"
 #include "tests/nodes/link/link_scene.h"
 
 enum { HZ = 512, TICK = 1953125, START = 100000 }; // a tick is a whole number of ns, and exact in binary

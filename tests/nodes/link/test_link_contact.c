@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/core/link*.c nodes/link/core/queue.c
 // First contact: an empty block asks for the node's sequence, a second one makes sure, and both end in time.
 #include "tests/nodes/link/link_scene.h"
 

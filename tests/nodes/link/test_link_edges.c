@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
+// sources: firmware/wire/*.c nodes/link/core/*.c nodes/link/io/*.c nodes/support/can_bits.c
 // A bus and a node that answers when it is told to, in virtual time: to whom each byte belongs, what each
 // counter says of it, and how many bytes may go at once.
 #include "tests/nodes/link/bus_scene.h"

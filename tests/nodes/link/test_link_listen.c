@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/core/link*.c nodes/link/core/queue.c
 // What a link makes of bytes: blocks and their responses, damage, blocks that are cut off, leads.
 #include "tests/nodes/link/link_scene.h"
 

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: nodes/link/queue.c
+// sources: nodes/link/core/queue.c
 // A ring of records: whole at every offset of its wrap, full to the last byte, with its high-water marks.
-#include "nodes/link/queue.h"
+#include "nodes/link/core/queue.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-#include "nodes/link/batch.h"
+#include "nodes/link/core/batch.h"
 #include "tests/check.h"
 
 enum { SIZE = 256, STAMP = 8 };

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/core/link*.c nodes/link/core/queue.c
 // What is not acknowledged: when it goes again and how, what naks say, and when the link is lost.
 #include "tests/nodes/link/link_scene.h"
 

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: nodes/link/schedule.c
+// sources: nodes/link/core/schedule.c
 // Budget, order and queue bound of a bus, by themselves: 500 kbit/s, so a bit lasts 2 µs.
 #include "tests/check.h"
 
-#include "nodes/link/schedule.h"
+#include "nodes/link/core/schedule.h"
 
 #define MS 1000000ULL
 #define S (1000 * MS)

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: nodes/link/schedule.c
+// sources: nodes/link/core/schedule.c
 // The figures of a bus's budget to the nanosecond: where each window, share and queue begins and ends.
 // 500 kbit/s: a bit lasts 2 µs, a full frame of 120 bits 240 µs, a full block of 1215 bits 2.43 ms.
 #include "tests/check.h"
 
-#include "nodes/link/schedule.h"
+#include "nodes/link/core/schedule.h"
 
 #define MS 1000000ULL
 #define S (1000 * MS)

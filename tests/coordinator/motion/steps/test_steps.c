@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: coordinator/motion/steps/step*.c coordinator/kinematics/*.c firmware/wire/vlq.c
+// sources: coordinator/motion/steps/step*.c coordinator/motion/steps/*/*.c coordinator/kinematics/*.c
+// sources: firmware/wire/vlq.c
 // Step generation under the sanitizers: memory of exactly the promised size, hostile numbers, random moves.
 #include "coordinator/motion/steps/steps.h"
-#include "nodes/link/batch.h"
+#include "nodes/link/core/batch.h"
 #include "tests/check.h"
 #include "wire/wire.h"
 
