@@ -1,5 +1,6 @@
 """Which tests execute a mutated line: measured once, kept, and measured again for test files that changed.
 
+Where a source is new, or has moved, all are measured again.
 Of a source file that changed since, all tests count that executed anything in it: too many, but none less.
 """
 
@@ -8,7 +9,7 @@ import json
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Final
@@ -94,7 +95,7 @@ def collect(*, everything: bool = False) -> CoverageMap:
         firsts[file] = total
         total += len(c_source.statement_spans(source))
     digests = {file: _digest(ROOT / file) for file in files()}
-    stale = [file for file in _test_files() if everything or not _is_current(file)]
+    stale = [file for file in _test_files() if everything or not _is_current(file, digests)]
     if stale:
         sys.stdout.write(f"coverage: measuring {len(stale)} test files\n")
         sys.stdout.flush()
@@ -141,8 +142,12 @@ def _stamp(file: str) -> Path:
     return _result(file).with_suffix(".stamp")
 
 
-def _is_current(file: str) -> bool:
-    return _stamp(file).exists() and json.loads(_stamp(file).read_text())["test"] == _digest(ROOT / file)
+def _is_current(file: str, sources: Iterable[str]) -> bool:
+    """Return whether test FILE was measured as it is, when all SOURCES were there."""
+    if not _stamp(file).exists():
+        return False
+    stamp = json.loads(_stamp(file).read_text())
+    return stamp["test"] == _digest(ROOT / file) and stamp["digests"].keys() >= set(sources)
 
 
 def _run_pytest(copy: ProjectCopy, tests: list[str], total: int) -> None:

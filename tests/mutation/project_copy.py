@@ -105,8 +105,9 @@ class ProjectCopy:
             if relative.parts[0] in COPIED and not (self.folder / relative).exists():
                 shutil.copy2(path, self.folder / relative)
         for part in COPIED:
-            for path in (self.folder / part).rglob("*.py"):
-                if path.relative_to(self.folder) not in wanted:
+            for path in (self.folder / part).rglob("*.*"):
+                is_source = path.suffix == ".py" or (path.suffix in {".c", ".h"} and path.name[0] != "_")
+                if is_source and path.relative_to(self.folder) not in wanted:
                     path.unlink()
 
     def write(self, file: str, content: bytes) -> None:
