@@ -147,7 +147,7 @@ def _is_current(file: str, sources: Iterable[str]) -> bool:
     if not _stamp(file).exists():
         return False
     stamp = json.loads(_stamp(file).read_text())
-    return stamp["test"] == _digest(ROOT / file) and stamp["digests"].keys() >= set(sources)
+    return bool(stamp["test"] == _digest(ROOT / file) and stamp["digests"].keys() >= set(sources))
 
 
 def _run_pytest(copy: ProjectCopy, tests: list[str], total: int) -> None:
