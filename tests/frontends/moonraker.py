@@ -130,19 +130,22 @@ class Moonraker:
         return str(self.query("print_stats")["print_stats"]["state"])
 
     def state(self) -> str:
-        """Return how Moonraker says that the machine is; empty while nothing answers."""
-        try:
-            return str(self.ask("/server/info")["klippy_state"])
-        except (Failed, OSError):
-            return ""
+        """Return how Moonraker says that the machine is; raises Failed and OSError while nothing answers."""
+        return str(self.ask("/server/info")["klippy_state"])
 
 
 def until(true: Callable[[], bool], what: str, limit_s: float = STEP_S) -> None:
-    """Wait until TRUE; raises Failed."""
+    """Wait until TRUE, which also may fail for a while, as a host restarts; raises Failed."""
     end_s = time.monotonic() + limit_s
-    while not true():
+    while True:
+        why = ""
+        try:
+            if true():
+                return
+        except (Failed, OSError) as failure:
+            why = f": {failure}"
         if time.monotonic() > end_s:
-            raise Failed(f"{what} did not come within {limit_s:g} s")
+            raise Failed(f"{what} did not come within {limit_s:g} s{why}")
         time.sleep(LOOK_S)
 
 
