@@ -113,6 +113,7 @@ def test_a_silent_sensor_is_an_error_in_every_tenth_look() -> None:
     said = host.ask(f"query_status_ldc1612 oid={LDC}")
     readings = said["next_sequence"] * 12 + said["buffered"] // 4
     assert readings == 500 // 10
+    assert said["buffered"] % 4 == 0, "whole readings, and none waits in the chip"
 
 
 def test_a_reading_above_the_threshold_triggers_the_stop_group_not_before_its_time() -> None:
