@@ -194,15 +194,23 @@ def _plain(value: object) -> object:
 
 def _bound_cpu() -> None:
     """End this process when the request at hand takes far too long."""
-    resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time()) + _ALONE_CPU_S, resource.RLIM_INFINITY))
+    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+    soft = _within(resource.RLIMIT_CPU, int(time.process_time()) + _ALONE_CPU_S)
+    resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
 
 
 def _bound_memory() -> None:
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    size = pages * resource.getpagesize() + MEMORY_BYTES
+    size = _within(resource.RLIMIT_AS, pages * resource.getpagesize() + MEMORY_BYTES)
     resource.setrlimit(resource.RLIMIT_AS, (size, size))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _within(what: int, limit: int) -> int:
+    """Return LIMIT, or the hard limit on WHAT that this process was given, where that is lower."""
+    _, hard = resource.getrlimit(what)
+    return limit if hard == resource.RLIM_INFINITY else min(limit, hard)
 
 
 def main() -> None:

@@ -161,3 +161,16 @@ def test_a_worker_that_cannot_be_started_is_a_sentence(monkeypatch: pytest.Monke
     with pytest.raises(RenderingFailed, match="cannot be started: No such file or directory"):
         renderer.render("{ 1 }", {}, {})
     renderer.close()
+
+
+def test_where_this_program_has_limits_of_its_own_the_worker_keeps_them() -> None:
+    """As under systemd's LimitCPU: a process without privileges cannot raise a hard limit."""
+    limits = "import resource\nresource.setrlimit(resource.RLIMIT_CPU, (60, 61))\n"
+    render = (
+        "from coordinator.gcode.templates.templates import Template\n"
+        "print(Template('{6 * 7}').render({}).text)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", limits + render], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.stdout.startswith("42"), done.stderr
