@@ -32,6 +32,7 @@ enum {
     REG_STATUS = 0x18,
     STATUS_UNREAD_0 = 1 << 3,
     READING_SIZE = 4,
+    REGISTER_SIZE = 2,
     SILENT_LOOKS = 10,
 };
 static const uint32_t LDC1612_LOST = 0xFFFFFFF0u;
@@ -61,12 +62,12 @@ static enum timer_result look_event(struct node *node, struct timer *timer) {
 // ------------------------------------------------------------------------------------------------ the chip
 
 static int read_register(struct node *node, const struct ldc1612 *ldc, uint8_t number, uint8_t *out) {
-    return i2c_transfer(node, ldc->i2c, &number, 1, out, 2);
+    return i2c_transfer(node, ldc->i2c, &number, 1, out, REGISTER_SIZE);
 }
 
 // Whether there is a new reading; -1: the chip cannot be asked.
 static int has_reading(struct node *node, const struct ldc1612 *ldc) {
-    uint8_t status[2];
+    uint8_t status[REGISTER_SIZE];
     if (ldc->has_intb)
         return !board_gpio_read(node, ldc->intb_pin);
     if (read_register(node, ldc, REG_STATUS, status))
@@ -75,7 +76,7 @@ static int has_reading(struct node *node, const struct ldc1612 *ldc) {
 }
 
 static uint32_t take_reading(struct node *node, const struct ldc1612 *ldc) {
-    uint8_t high[2], low[2], status[2];
+    uint8_t high[REGISTER_SIZE], low[REGISTER_SIZE], status[REGISTER_SIZE];
     if (read_register(node, ldc, REG_DATA0_MSB, high) || read_register(node, ldc, REG_DATA0_LSB, low))
         return LDC1612_LOST + I2C_DATA_ERROR;
     if (ldc->has_intb && read_register(node, ldc, REG_STATUS, status)) // releases INTB

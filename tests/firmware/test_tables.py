@@ -135,6 +135,13 @@ def test_a_pause_within_a_word_begins_a_new_word() -> None:
 # ---------------------------------------------------------------------------------------------- activation
 
 
+def test_behind_the_end_of_a_table_there_are_zeros(host: Host) -> None:
+    for table in ((*TABLE, (7, 7)), TABLE, (*TABLE, (7, 7)), TABLE):
+        download(host, table, [1])
+    answer = host.ask(f"table_read oid=1 index={len(TABLE)}")
+    assert (answer["x"], answer["y"]) == (0, 0)
+
+
 def test_an_activation_happens_at_its_very_clock(host: Host) -> None:
     download(host, TABLE, [1])
     assert active(host) == (NEVER, 0, 0, 0)
@@ -281,6 +288,16 @@ def test_a_polled_register_sees_every_word_that_stands_for_t(host: Host) -> None
     for number, table in enumerate((TABLE, ((5, 5),) * 4, (), OTHER)):
         write_register(host, transmission(table, [1]), 1000)
         assert (state(host)[:2], kept(host)) == ((OK, number + 1), table)
+
+
+def test_polling_begins_at_its_clock(host: Host) -> None:
+    host.send(f"table_register_poll oid=3 clock={host.now + 50_000} rest_ticks=1000")
+    words_before = host.ask("table_query oid=1")["words"]
+    write_register(host, transmission(TABLE, [1])[:10], 1000)
+    assert host.ask("table_query oid=1")["words"] == words_before
+    host.run(50_000)
+    write_register(host, transmission(TABLE, [1]), 1000)
+    assert kept(host) == TABLE
 
 
 def test_a_polled_register_misses_words_that_come_too_fast(host: Host) -> None:

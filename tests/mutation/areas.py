@@ -32,8 +32,8 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
 }
 """Name of an area to the patterns of its files, from the project's root."""
 
-LEFT_OUT: Final = ("build_*.py", "__init__.py", "_*")
-"""Build scripts, packages' faces and generated files."""
+LEFT_OUT: Final = ("build_*.py", "__init__.py", "_*", "interfaces.py")
+"""Build scripts, packages' faces, generated files and protocols, which have no code."""
 
 SAFETY: Final = (
     *(f"firmware/core/{name}" for name in ("sched.c", "node.h")),

@@ -53,7 +53,9 @@ class CoverageMap:
     """Python: by file and line."""
     by_file: dict[str, set[CoveringTest]] = field(default_factory=lambda: defaultdict(set))
     imported: set[tuple[str, int]] = field(default_factory=set)
-    """Python lines executed when the file is imported."""
+    """Python lines executed when the file is imported: the default of a field, for one. Tests in the folder
+    that mirrors the file's count for them, too."""
+    every: set[CoveringTest] = field(default_factory=set)
     changed: set[tuple[str, str]] = field(default_factory=set)
     """Test file and source file that changed after the former was measured."""
     failed: list[str] = field(default_factory=list)
@@ -74,7 +76,10 @@ class CoverageMap:
         statement = python_source.statement_line(source, mutation.start)
         for line in (mutation.line, statement):
             if (mutation.file, line) in self.imported:
-                return self.by_file[mutation.file]
+                mirror = PurePath("tests") / PurePath(mutation.file).parent
+                return self.by_file[mutation.file] | {
+                    test for test in self.every if PurePath(test.file).parent == mirror
+                }
             if found := self.by_line[mutation.file, line]:
                 return found
         return set()
@@ -203,6 +208,7 @@ def _read(digests: dict[str, str]) -> CoverageMap:
                 found.failed.append(node_id)
                 continue
             test = CoveringTest(node_id, entry["seconds"])
+            found.every.add(test)
             for file, number in _in_files(entry["c"], bounds):
                 found.by_statement[file, number].add(test)
                 found.by_file[file].add(test)

@@ -390,6 +390,22 @@ static void a_shutdown_is_reported_once_as_soon_as_there_is_room(void) {
     CHECK_EQUAL(waiting(), 0);
 }
 
+static void a_response_that_fits_no_block_is_a_shutdown(void) {
+    static const uint8_t types_long[] = {WIRE_BYTES};
+    static const struct node_response response_long = {.types = types_long, .id = 23, .arg_count = 1};
+    uint8_t bytes[WIRE_CONTENT_MAX] = {0};
+    start(0);
+    CHECK_EQUAL(RESPOND(&node, long, BYTES(bytes, WIRE_CONTENT_MAX)), -1);
+    CHECK(node.shutdown.active);
+    CHECK_EQUAL(node.shutdown.reason, string_encode_error);
+    CHECK_EQUAL(waiting(), 0);
+    start(0);
+    const struct wire_arg two[2] = {{.value = 1}, {.value = 2}};
+    CHECK_EQUAL(node_respond(&node, &response_shutdown, two, 1), -1);
+    CHECK_EQUAL(node.shutdown.reason, string_encode_error);
+    CHECK_EQUAL(waiting(), 0);
+}
+
 // -------------------------------------------------------------------------------------------------- deadline
 
 static void the_next_deadline_is_the_earliest_of_three(void) {
@@ -510,6 +526,7 @@ int main(void) {
     timers_that_run_on_the_spot_are_stopped();
     a_shutdown_runs_every_hook_once_and_keeps_its_first_reason();
     a_shutdown_is_reported_once_as_soon_as_there_is_room();
+    a_response_that_fits_no_block_is_a_shutdown();
     the_next_deadline_is_the_earliest_of_three();
     memory_is_zeroed_aligned_and_ends_where_the_arena_does();
     objects_are_found_by_number_and_type();
