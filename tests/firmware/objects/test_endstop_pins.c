@@ -2,16 +2,13 @@
 // sources: firmware/objects/endstop.c
 // What an endstop's configuration asks of the board, and that its shutdown hook leaves no timer: the rest of
 // it is tested on a simulated board, whose pins know no pull-up.
-#include "boards/board.h"
 #include "objects/trsync.h"
-#include "tests/check.h"
+#include "tests/firmware/objects/lone_object.h"
 
 const uint16_t string_invalid_input_pin = 3;
 const struct node_response response_endstop_state;
 
-static struct node node;
-static _Alignas(16) uint8_t object[256];
-static uint32_t asked_pin, deleted, shutdowns, created;
+static uint32_t asked_pin, deleted, shutdowns;
 static int asked_pull, answer;
 
 int board_gpio_in(struct node *at, uint32_t pin, int pull) {
@@ -23,15 +20,6 @@ int board_gpio_in(struct node *at, uint32_t pin, int pull) {
 int board_gpio_read(struct node *at, uint32_t pin) {
     CHECK(at == &node && pin == asked_pin);
     return 1;
-}
-
-uint32_t board_irq_save(struct node *at) {
-    (void)at;
-    return 0;
-}
-
-void board_irq_restore(struct node *at, uint32_t state) {
-    CHECK(at == &node && !state);
 }
 
 void sched_add_timer(struct node *at, struct timer *timer) {
@@ -56,22 +44,6 @@ int node_respond(struct node *at, const struct node_response *response, const st
     return 0;
 }
 
-void *oid_create(struct node *at, uint32_t oid, const struct oid_type *type, size_t size) {
-    CHECK(at == &node && oid == 9 && type && size <= sizeof(object));
-    created++;
-    return object;
-}
-
-void *oid_find(struct node *at, uint32_t oid, const struct oid_type *type) {
-    CHECK(at == &node && oid == 9 && type);
-    return object;
-}
-
-void *oid_next(const struct node *at, unsigned *oid, const struct oid_type *type) {
-    CHECK(at == &node && type);
-    return (*oid)++ ? NULL : object;
-}
-
 struct trsync *trsync_find(struct node *at, uint32_t oid) {
     (void)at;
     (void)oid;
@@ -90,14 +62,14 @@ void endstop_shutdown(struct node *at);
 int main(void) {
     for (int pull = -1; pull <= 1; pull++) {
         const struct wire_arg args[4] = {
-            {.value = 9}, {.value = 20}, {.value = (uint8_t)pull}, {.value = 77}};
+            {.value = OID}, {.value = 20}, {.value = (uint8_t)pull}, {.value = 77}};
         command_config_endstop(&node, args);
         CHECK_EQUAL(asked_pin, 20);
         CHECK_EQUAL(asked_pull, pull);
     }
     CHECK_EQUAL(created, 3);
     answer = -1;
-    command_config_endstop(&node, (const struct wire_arg[3]){{.value = 9}, {.value = 20}});
+    command_config_endstop(&node, (const struct wire_arg[3]){{.value = OID}, {.value = 20}});
     CHECK(shutdowns == 1 && created == 3);
     endstop_shutdown(&node);
     CHECK_EQUAL(deleted, 1);

@@ -2,16 +2,13 @@
 // sources: firmware/objects/pwm_out.c
 // What a hardware PWM's configuration asks of the board and of its timed output: a simulated board's pins
 // know no cycle.
-#include "boards/board.h"
 #include "objects/timed_output.h"
-#include "tests/check.h"
+#include "tests/firmware/objects/lone_object.h"
 
 const uint16_t string_missed_pwm = 1, string_exceeds_pwm = 2, string_invalid_pwm_pin = 3;
 
-static struct node node;
 static struct timed_output *output;
-static _Alignas(16) uint8_t object[256];
-static uint32_t pin, cycle, value, written, updated, stopped, shutdowns, created, inits;
+static uint32_t pin, cycle, value, written, updated, stopped, shutdowns, inits;
 static int answer;
 
 int board_pwm_setup(struct node *at, uint32_t asked_pin, uint32_t cycle_ticks, uint16_t asked_value) {
@@ -25,35 +22,10 @@ void board_pwm_write(struct node *at, uint32_t asked_pin, uint16_t asked_value) 
     written = asked_value;
 }
 
-uint32_t board_irq_save(struct node *at) {
-    (void)at;
-    return 0;
-}
-
-void board_irq_restore(struct node *at, uint32_t state) {
-    CHECK(at == &node && !state);
-}
-
 void node_shutdown(struct node *at, uint16_t reason) {
     CHECK(at == &node);
     CHECK_EQUAL(reason, string_invalid_pwm_pin);
     shutdowns++;
-}
-
-void *oid_create(struct node *at, uint32_t oid, const struct oid_type *type, size_t size) {
-    CHECK(at == &node && oid == 9 && type && size <= sizeof(object));
-    created++;
-    return object;
-}
-
-void *oid_find(struct node *at, uint32_t oid, const struct oid_type *type) {
-    CHECK(at == &node && oid == 9 && type);
-    return object;
-}
-
-void *oid_next(const struct node *at, unsigned *oid, const struct oid_type *type) {
-    CHECK(at == &node && type && *oid <= 1);
-    return (*oid)++ ? NULL : object;
 }
 
 void timed_output_init(struct timed_output *at) {
@@ -80,7 +52,7 @@ void command_queue_pwm_out(struct node *at, const struct wire_arg *args);
 void pwm_out_shutdown(struct node *at);
 
 int main(void) {
-    const struct wire_arg args[6] = {{.value = 9},   {.value = 41}, {.value = 1000},
+    const struct wire_arg args[6] = {{.value = OID}, {.value = 41}, {.value = 1000},
                                      {.value = 300}, {.value = 7},  {.value = 5000}};
     command_config_pwm_out(&node, args);
     CHECK(pin == 41 && cycle == 1000 && value == 300);
@@ -90,7 +62,7 @@ int main(void) {
     CHECK(output->missed == string_missed_pwm && output->exceeded == string_exceeds_pwm);
     output->apply(&node, output, 99, 32768);
     CHECK_EQUAL(written, 32768);
-    command_queue_pwm_out(&node, (const struct wire_arg[3]){{.value = 9}, {.value = 123}, {.value = 45}});
+    command_queue_pwm_out(&node, (const struct wire_arg[3]){{.value = OID}, {.value = 123}, {.value = 45}});
     pwm_out_shutdown(&node);
     CHECK_EQUAL(stopped, 1);
     answer = -1;

@@ -2,16 +2,13 @@
 // sources: firmware/objects/analog_in.c
 // An analog input on a board whose converter needs time, as those of real chips do: simulated boards answer
 // at once.
-#include "boards/board.h"
-#include "tests/check.h"
+#include "tests/firmware/objects/lone_object.h"
 
-enum { OID = 9, PIN = 50, CONVERSION = 700, BEGIN = 1000, APART = 10000, REST = 1000000, COUNT = 3 };
+enum { PIN = 50, CONVERSION = 700, BEGIN = 1000, APART = 10000, REST = 1000000, COUNT = 3 };
 
 const uint16_t string_adc_range = 1, string_adc_pin = 2, string_adc_report = 3;
 const struct node_response response_analog_in_state;
 
-static struct node node;
-static _Alignas(16) uint8_t object[256];
 static struct timer *added;
 static uint32_t asked_at, conversions, reported_clock;
 
@@ -29,15 +26,6 @@ uint32_t board_adc_sample(struct node *at, uint32_t pin, uint16_t *value) {
     }
     *value = (uint16_t)++conversions;
     return 0;
-}
-
-uint32_t board_irq_save(struct node *at) {
-    CHECK(at == &node);
-    return 0;
-}
-
-void board_irq_restore(struct node *at, uint32_t state) {
-    CHECK(at == &node && !state);
 }
 
 void sched_add_timer(struct node *at, struct timer *timer) {
@@ -66,24 +54,6 @@ int node_respond(struct node *at, const struct node_response *response, const st
     CHECK_EQUAL(args[2].value, 2);
     CHECK_EQUAL(args[2].data[0] | args[2].data[1] << 8, 1 + 2 + 3);
     return 0;
-}
-
-void *oid_create(struct node *at, uint32_t oid, const struct oid_type *type, size_t size) {
-    CHECK(at == &node && oid == OID && type && size <= sizeof(object));
-    return object;
-}
-
-void *oid_find(struct node *at, uint32_t oid, const struct oid_type *type) {
-    CHECK(at == &node && oid == OID && type);
-    return object;
-}
-
-void *oid_next(const struct node *at, unsigned *oid, const struct oid_type *type) {
-    CHECK(at == &node && type);
-    if (*oid > OID)
-        return NULL;
-    *oid = OID + 1;
-    return object;
 }
 
 void command_config_analog_in(struct node *at, const struct wire_arg *args);

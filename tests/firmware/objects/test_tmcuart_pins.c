@@ -2,18 +2,13 @@
 // sources: firmware/objects/tmcuart.c
 // Which way the line is driven: simulated pins know no direction. With one pin for both ways the first bit
 // makes it an output, and the turn an input again.
-#include "boards/board.h"
-#include "tests/check.h"
+#include "tests/firmware/objects/lone_object.h"
 
-#include <string.h>
-
-enum { OID = 9, BIT_TIME = 400, BITS = 16 };
+enum { BIT_TIME = 400, BITS = 16 };
 
 const uint16_t string_tmcuart_pin = 1, string_tmcuart_bit_time = 2, string_tmcuart_large = 3;
 const struct node_response response_tmcuart_response;
 
-static struct node node;
-static _Alignas(16) uint8_t object[256];
 static struct timer *added;
 static char calls[64];
 
@@ -50,15 +45,6 @@ uint32_t board_clock(struct node *at) {
     return 1000;
 }
 
-uint32_t board_irq_save(struct node *at) {
-    CHECK(at == &node);
-    return 0;
-}
-
-void board_irq_restore(struct node *at, uint32_t state) {
-    CHECK(at == &node && !state);
-}
-
 void sched_add_timer(struct node *at, struct timer *timer) {
     CHECK(at == &node);
     added = timer;
@@ -87,24 +73,6 @@ int node_respond(struct node *at, const struct node_response *response, const st
     CHECK(at == &node && response == &response_tmcuart_response && count == 2);
     CHECK_EQUAL(args[0].value, OID);
     return 0;
-}
-
-void *oid_create(struct node *at, uint32_t oid, const struct oid_type *type, size_t size) {
-    CHECK(at == &node && oid == OID && type && size <= sizeof(object));
-    return memset(object, 0, sizeof(object));
-}
-
-void *oid_find(struct node *at, uint32_t oid, const struct oid_type *type) {
-    CHECK(at == &node && oid == OID && type);
-    return object;
-}
-
-void *oid_next(const struct node *at, unsigned *oid, const struct oid_type *type) {
-    CHECK(at == &node && type);
-    if (*oid > OID)
-        return NULL;
-    *oid = OID + 1;
-    return object;
 }
 
 void command_config_tmcuart(struct node *at, const struct wire_arg *args);
