@@ -116,6 +116,27 @@ def test_a_silent_sensor_is_an_error_in_every_tenth_look() -> None:
     assert said["buffered"] % 4 == 0, "whole readings, and none waits in the chip"
 
 
+def test_each_query_begins_to_count_silent_looks() -> None:
+    host = reading_host()
+    fault(host, PlantFault.DEAD)
+    for looks in (5, 9):
+        query(host)
+        host.run(ms(host, 2 * looks + 1))
+    status = f"query_status_ldc1612 oid={LDC}"
+    assert host.ask(status)["buffered"] == 0
+    host.run(ms(host, 2))
+    assert host.ask(status)["buffered"] == 4
+
+
+def test_homing_is_ended_without_a_stop_group() -> None:
+    host = reading_host()
+    query(host)
+    home(host, FREQUENCY - 100)
+    names = ("clock", "trsync_oid", "threshold", "trigger_reason", "error_reason")
+    assert host.send(f"ldc1612_setup_home oid={LDC} {' '.join(f'{name}=0' for name in names)}") == []
+    assert triggers(host.run(ms(host, 100))) == []
+
+
 def test_a_reading_above_the_threshold_triggers_the_stop_group_not_before_its_time() -> None:
     host = reading_host()
     query(host)

@@ -302,6 +302,15 @@ def test_presses_are_reported_until_acknowledged() -> None:
     assert [a.args for a in host.run(2500)] == [{"oid": 2, "ack_count": 2, "state": b"\x02"}]
 
 
+def test_a_position_without_a_pin_is_open() -> None:
+    host = Host()
+    host.configure("config_buttons oid=2 button_count=2", "buttons_add oid=2 pos=1 pin=61 pull_up=1")
+    for pin in (0, 61):
+        host.node.set_input(pin, 1)
+    host.send(f"buttons_query oid=2 clock={host.now + 1000} rest_ticks=1000 retransmit_count=10 invert=0")
+    assert [a.args["state"] for a in host.run(4000)] == [b"\x02"]
+
+
 def test_a_bounce_shorter_than_two_samples_is_no_press() -> None:
     host = buttons()
     host.run(10_500)

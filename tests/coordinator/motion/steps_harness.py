@@ -109,6 +109,8 @@ class Run:
             assert counted.framed_bytes == node.framed_bytes()
             assert counted.commands == len(node.records)
             assert counted.content_bytes == sum(record.size for record in node.records)
+            steps = [record for record in node.records if record.name == "queue_step"]
+            assert counted.late_slots == sum(record.min_clock > record.first for record in steps)
         for i, s in enumerate(stats.steppers):
             mine = [r for r in self.nodes[self.steppers[i].node].records if r.oid == self.steppers[i].oid]
             assert s.steps == len(self.steps(i))

@@ -9,7 +9,7 @@ enum { PIN = 50, CONVERSION = 700, BEGIN = 1000, APART = 10000, REST = 1000000, 
 const uint16_t string_adc_range = 1, string_adc_pin = 2, string_adc_report = 3;
 const struct node_response response_analog_in_state;
 
-static struct timer *added;
+static struct timer *added, *deleted;
 static uint32_t asked_at, conversions, reported_clock;
 
 int board_adc_setup(struct node *at, uint32_t pin) {
@@ -34,7 +34,8 @@ void sched_add_timer(struct node *at, struct timer *timer) {
 }
 
 void sched_delete_timer(struct node *at, struct timer *timer) {
-    CHECK(at == &node && timer);
+    CHECK(at == &node);
+    deleted = timer;
 }
 
 void node_shutdown(struct node *at, uint16_t reason) {
@@ -59,6 +60,7 @@ int node_respond(struct node *at, const struct node_response *response, const st
 void command_config_analog_in(struct node *at, const struct wire_arg *args);
 void command_query_analog_in(struct node *at, const struct wire_arg *args);
 void analog_in_task(struct node *at);
+void analog_in_shutdown(struct node *at);
 
 int main(void) {
     command_config_analog_in(&node, (const struct wire_arg[2]){{.value = OID}, {.value = PIN}});
@@ -77,5 +79,14 @@ int main(void) {
     CHECK_EQUAL(added->waketime, BEGIN + REST); // however long the samples took
     analog_in_task(&node);
     CHECK_EQUAL(reported_clock, BEGIN + REST);
+    // What was to be reported when the node shuts down is not.
+    conversions = reported_clock = 0;
+    for (int call = 0; call < 2 * COUNT; call++)
+        CHECK_EQUAL(added->function(&node, added), TIMER_AGAIN);
+    deleted = NULL;
+    analog_in_shutdown(&node);
+    CHECK(deleted == added);
+    analog_in_task(&node);
+    CHECK_EQUAL(reported_clock, 0);
     return 0;
 }
