@@ -2,8 +2,10 @@
 .PHONY: frontends octoprint
 
 MOONRAKER := moonraker==0.11.0
+# A name with = would be a variable where make is called with it.
+MOONRAKER_STAMP := build/frontends/$(subst ==,-,$(MOONRAKER))
 
-build/frontends/$(MOONRAKER):
+$(MOONRAKER_STAMP):
 	python3 -m venv build/frontends
 	build/frontends/bin/pip install --quiet --disable-pip-version-check $(MOONRAKER)
 	touch $@
@@ -13,7 +15,7 @@ build/frontends/$(MOONRAKER):
 FRONT_ENDS ?= ../shared/frontends
 
 frontends: setup
-	@if $(MAKE) --no-print-directory build/frontends/$(MOONRAKER); then \
+	@if $(MAKE) --no-print-directory $(MOONRAKER_STAMP); then \
 	  $(BIN)/python -m tests.frontends.moonraker build/frontends/bin/moonraker && \
 	  $(BIN)/python -m tests.frontends build/frontends/bin/moonraker $(FRONT_ENDS); \
 	else echo "skipped: Moonraker and the front ends; pip could not install $(MOONRAKER)"; fi
