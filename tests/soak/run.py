@@ -59,7 +59,7 @@ def service(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
         try:
             yield process
         finally:
-            process.send_signal(signal.SIGINT)
+            process.terminate()
             try:
                 process.wait(END_S)
             except subprocess.TimeoutExpired:
