@@ -5,9 +5,10 @@ all its threads, from /proc. Processor time is in % of one core; a wake-up is a 
 States: waiting (connected, nothing to do), heating (both heaters hold a temperature), printing, watched
 (printing, with a Moonraker that two browsers use: a connection that watches all objects and the answers of
 G-code, with four queries and two `info` a second; --clients 3: as many connections that share these requests;
-by turns with printing, twice). One node is config/cartesian_uart.cfg on a pseudo-terminal, three are
-the demo's machine. Each state begins with some seconds that are left out. A script at rest is one G-code line
-of a client of the Klippy API, from its sending to its answer.
+by turns with printing, twice, each time the same part of a new print). One node is
+config/cartesian_uart.cfg on a pseudo-terminal, three are the demo's machine. Each state begins with some
+seconds that are left out. A script at rest is one G-code line of a client of the Klippy API, from its sending
+to its answer.
 
 With --peer PATH (the peer's klippy.py) the same happens with that host on the same node, configuration file
 and program; its Python is --peer-python. The peer is not a part of this project: without the option only
@@ -54,7 +55,7 @@ ROUNDS = 2
 """Of printing and watched by turns."""
 WATCHED_S = 0.25
 """Between two queries of all clients together."""
-CARD = "\n[virtual_sdcard]\npath: {folder}\n"
+CARD = "\n[virtual_sdcard]\npath: {folder}\n[pause_resume]\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,14 +276,20 @@ def print_lead(ipc: Path) -> None:
 
 
 def print_stats(client: KlippyClient) -> dict[str, Any]:
-    """Return how the print does; ends the benchmark when it does not print."""
+    """Return how the print does; ends the benchmark when the machine has stopped."""
     info = client.call("info")
     if info["state"] != "ready":
         sys.exit(f"the machine stopped: {info['state_message']}")
-    stats = client.call("objects/query", objects={"print_stats": None})["status"]["print_stats"]
-    if stats["state"] not in ("printing", "standby"):  # it has begun, or is about to
-        sys.exit(f"it does not print: {stats}")
-    return dict(stats)
+    return dict(client.call("objects/query", objects={"print_stats": None})["status"]["print_stats"])
+
+
+def wait_for(client: KlippyClient, condition: Callable[[dict[str, Any]], bool]) -> None:
+    """Wait until the print's CONDITION holds; ends the benchmark when it does not in time."""
+    until_s = time.monotonic() + START_S
+    while not condition(stats := print_stats(client)):
+        if time.monotonic() > until_s:
+            sys.exit(f"the print does not do what it should: {stats}")
+        time.sleep(0.5)
 
 
 def run_print(
@@ -290,17 +297,18 @@ def run_print(
 ) -> None:
     """Measure a host in the states of a print."""
     client.script("M140 S60\nM104 S200")
-    client.script("SDCARD_PRINT_FILE FILENAME=part.gcode")
-    while print_stats(client)["filament_used"] < FILAMENT_MM:
-        time.sleep(0.5)
-    for _ in range(ROUNDS if "watched" in chosen.only else 1):  # no part of a print costs the same
-        state("printing")
-        if "watched" in chosen.only:
-            with watched(api, chosen.clients):
-                state("watched")
+    rounds = ROUNDS if "watched" in chosen.only else 1
+    for name in [name for name in ("printing", "watched") if name in chosen.only] * rounds:
+        client.script("SDCARD_PRINT_FILE FILENAME=part.gcode")
+        wait_for(client, lambda stats: stats["state"] == "printing")
+        wait_for(client, lambda stats: stats["filament_used"] >= FILAMENT_MM)
+        with watched(api, chosen.clients) if name == "watched" else contextlib.nullcontext():
+            state(name)
+        if print_stats(client)["state"] != "printing":
+            sys.exit("the print ended before it was measured; take fewer --seconds")
+        client.script("CANCEL_PRINT")
+        wait_for(client, lambda stats: stats["state"] == "cancelled")
     print_lead(api.parent / "ipc")
-    if print_stats(client)["state"] != "printing":
-        sys.exit("the print ended before it was measured; take fewer --seconds")
 
 
 def run_states(command: list[str], api: Path, folder: Path, chosen: argparse.Namespace) -> None:

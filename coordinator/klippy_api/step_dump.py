@@ -45,11 +45,14 @@ class StepDump:
 
     async def take(self, motion: Motion, machine: Machine) -> Mapping[str, Any] | None:
         """Return a message about the commands that were not returned before; None: there are none."""
-        sent, piece, seen = motion.trace.sent, motion.streamer.worker.maps[self._node].last, self._seen
+        sent, seen = motion.trace.sent, self._seen
         self._seen, batches = motion.trace.batches_after(self._node, seen)
         if len(batches) < self._seen - seen:
             self._begin(sent)
             return None
+        if not batches:
+            return None
+        piece = motion.streamer.worker.maps[self._node].last
         before, last_count = self._count, sent.counts[self._index] if sent.counts else 0
         self._count = last_count
         rows = await self._reader.read(batches, last_count - before)

@@ -9,7 +9,6 @@ threads of the service are measured. Exit status 1: a print did not succeed, or 
 import argparse
 import asyncio
 import random
-import signal
 import subprocess
 import sys
 import tempfile

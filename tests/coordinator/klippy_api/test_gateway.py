@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from coordinator.klippy_api.gateway import BLOCKED_S, CLIENTS_MAX
+from coordinator.klippy_api.step_dump import StepDump
 from coordinator.klippy_api.wire import MESSAGE_BYTES_MAX
 from tests.coordinator.klippy_api import schema
 from tests.stages.klippy_clients import KlippyApi, KlippyClient
@@ -227,6 +228,17 @@ async def _check_step_dumps(api: KlippyApi, client: KlippyClient) -> None:
     for params in (event["params"] for event in late.events):
         rows = params["data"]
         assert whole[params["last_clock"]][-len(rows) :] == rows
+
+
+def test_a_stepper_is_watched_before_motion_has_begun(tmp_path: Path) -> None:
+    printer = Printer(tmp_path)
+
+    async def main(served: Served) -> None:
+        motion, machine = served.service.ready_motion(), served.service.up_machine()
+        motion.streamer.worker.maps = []  # as before its first clocks are there
+        assert await StepDump("stepper_x", {}, motion, machine).take(motion, machine) is None
+
+    printer.serve(main)
 
 
 def _step_rows_end_mm(params: dict[str, Any]) -> float:
