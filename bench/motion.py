@@ -2,7 +2,8 @@
 
     python bench/motion.py [--runs N] [--prove] [--only PART] [CONFIG.cfg ... FILE.gcode ...]
 
-Parts: plans (whole ``canductor plan`` processes, start-up included, median CPU time), generation (steps per
+Parts: plans (whole ``canductor plan`` processes, start-up included, median CPU time; below the table the same
+of a program without a move, which is what a start costs), generation (steps per
 second of CPU time, one core), scaling (length of the file, microsteps, length of the segments). --prove
 replays every emitted command of each plan and compares every step with an independent evaluation.
 Without files: those beside the project if they are there, else the demo's.
@@ -123,6 +124,10 @@ def table_of_plans(configs: Sequence[Path], programs: Sequence[Path], runs: int)
                     f"{ours.steps / peer.steps:12.3f}{ours.queue_steps / peer.queue_steps:13.3f}"
                     f"{ours.size / peer.size:11.3f}{ours.worst_us / peer.worst_us:7.2f}"
                 )
+        empty = Path(folder) / "empty.gcode"
+        empty.write_text("")
+        for config in configs:
+            print(row(f"start, {config.stem}", plan_often(config, empty, runs)))
 
 
 def as_the_peer_reads(program: Path, folder: Path) -> Path:
