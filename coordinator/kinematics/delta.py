@@ -75,6 +75,11 @@ class Delta(Kinematics):
         return self.radius * math.cos(tower.angle), self.radius * math.sin(tower.angle)
 
     @property
+    def feet(self) -> tuple[tuple[float, float], ...]:
+        """X and Y of the joints, by tower, mm."""
+        return tuple(self._foot(tower) for tower in self.towers)
+
+    @property
     def widest_radius(self) -> float:
         """How far from the middle the head may be before a rod lies too flat."""
         return self.shortest_rod * _FLATTEST - self.radius

@@ -12,6 +12,7 @@ import numpy as np
 
 from coordinator.config.model import SECOND_CARRIAGE, MachineDescription, RailDescription, StepperDescription
 from coordinator.kinematics.base import Point
+from coordinator.kinematics.delta import Delta
 from coordinator.virtual_machine.plant_bed import BedSettings, ProbeParts, probe_parts
 from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
 from coordinator.virtual_machine.plant_tmc import machine_drivers
@@ -66,7 +67,7 @@ def machine_plants(
         for rail in _rails(description)
         if rail.homing.endstop_pin is not None
     ]
-    probe = _probe(description, start, settings)
+    probe = _probe(description, start, rails, settings)
     plants = [_mechanics(description, node.name, endstops, settings) for node in description.nodes]
     if probe is not None:
         plants = [_with_probe(plant, probe) for plant in plants]
@@ -124,15 +125,40 @@ def _mechanics(
     )
 
 
-def _probe(description: MachineDescription, start: Point, settings: PlantSettings) -> ProbeParts | None:
-    """Return the probe with its axes; None: there is none, or X and Y are no sums of motors."""
+def _probe(
+    description: MachineDescription, start: Point, rails: Sequence[float], settings: PlantSettings
+) -> ProbeParts | None:
+    """Return the probe with its axes; None: there is none, or it is not known where the nozzle is.
+
+    That is known of a delta whose probe is a switch, and where X and Y are sums of motors.
+    """
     if description.probe is None:
         return None
+    pin = description.probe.rail.homing.endstop_pin
+    if isinstance(configured := description.kinematics, Delta) and pin is not None and not pin.sensor:
+        joints = _joints(description, configured, settings.bed.delta or configured, rails)
+        return probe_parts(description, joints, settings.bed)
     terms = [_axis_terms(description, replace(description.rails[0], axis=letter)) for letter in AXES]
     if not all(terms):
         return None
     axes = [Axis(name=f"probe_{a}", terms=t, origin=o) for a, t, o in zip(AXES, terms, start, strict=True)]
     return probe_parts(description, axes, settings.bed)
+
+
+def _joints(
+    description: MachineDescription, configured: Delta, true: Delta, rails: Sequence[float]
+) -> list[Axis]:
+    """Return the heights of a delta's joints: the motors know where the CONFIGURED endstops are."""
+    by_name = {rail.axis: rail.steppers for rail in description.rails}
+    ends = zip(configured.endstop_positions, true.endstop_positions, strict=True)
+    return [
+        Axis(
+            name=f"joint_{name}",
+            terms=tuple(Term(s.node, s.name, s.step_distance / len(by_name[name])) for s in by_name[name]),
+            origin=at + true_end - end,
+        )
+        for name, at, (end, true_end) in zip(configured.rails, rails, ends, strict=True)
+    ]
 
 
 def _with_probe(plant: NodePlant, parts: ProbeParts) -> NodePlant:
@@ -141,7 +167,7 @@ def _with_probe(plant: NodePlant, parts: ProbeParts) -> NodePlant:
     axes = (*plant.axes, *parts.axes)
     if isinstance(parts.probe, Coil):
         return replace(plant, axes=axes, beds=(parts.bed,), coils=(parts.probe,))
-    return replace(plant, axes=axes, beds=(parts.bed,), probes=(parts.probe,))
+    return replace(plant, axes=axes, beds=(parts.bed,), probes=(parts.probe,), deltas=parts.deltas)
 
 
 def _stepper(stepper: StepperDescription, settings: PlantSettings) -> Stepper:

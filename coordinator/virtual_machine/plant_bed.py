@@ -10,7 +10,9 @@ from coordinator.config.file import parse_config
 from coordinator.config.model import MachineDescription
 from coordinator.config.pins import PinOption
 from coordinator.config.sections.nodes import make_pin_registry
+from coordinator.kinematics.delta import Delta
 from nodes.support.errors import CanductorError
+from nodes.virtual import plant
 from nodes.virtual.plant import Axis, Bed, Coil, Probe, Term
 
 _BUSES: Final = ("i2c1", "i2c2")
@@ -41,6 +43,8 @@ class BedSettings:
     supports: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """X and Y of where each motor of Z carries the frame; none: it cannot tilt. The frame is a plane, where
     more than three carry it the one that fits best."""
+    delta: Delta | None = None
+    """Of a delta, what it truly is; None: as configured."""
     raised_mm: Mapping[str, float] = field(default_factory=dict)
     """How much higher the frame begins at a motor's support."""
 
@@ -53,17 +57,21 @@ class ProbeParts:
     axes: tuple[Axis, ...]
     bed: Bed
     probe: Probe | Coil
+    deltas: tuple[plant.Delta, ...] = ()
 
 
 def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings: BedSettings) -> ProbeParts:
-    """Return the probe of a machine whose X, Y and Z are AXES, which the nodes' motors move."""
+    """Return the probe of a machine whose X, Y and Z, or a delta's joints, are AXES, which motors move."""
     described = description.probe
     assert described is not None
     pin = described.rail.homing.endstop_pin
     assert pin is not None
     x, y, z = axes
     tilts: tuple[Axis, ...] = ()
-    if settings.supports:
+    delta = None
+    if isinstance(description.kinematics, Delta):
+        delta = _delta(settings.delta or description.kinematics, axes)
+    elif settings.supports:
         z, *tilts_ = frame_axes(description, z, settings)
         tilts = tuple(tilts_)
     if pin.sensor:
@@ -74,9 +82,10 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
         name="probe",
         pin=pin.name,
         bed=settings.shape.name,
-        x=x.name,
-        y=y.name,
-        z=z.name,
+        x=None if delta else x.name,
+        y=None if delta else y.name,
+        z=None if delta else z.name,
+        delta=None if delta is None else delta.name,
         slope_x=tilts[0].name if tilts else None,
         slope_y=tilts[1].name if tilts else None,
         offset_x=described.offset[0],
@@ -89,7 +98,28 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
         lean_y=settings.lean_y,
         control_pin=_control_pin(description, described.section, pin.node),
     )
-    return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, probe)
+    return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, probe, () if delta is None else (delta,))
+
+
+def _delta(true: Delta, joints: Sequence[Axis]) -> plant.Delta:
+    """Return the TRUE delta whose JOINTS have these heights."""
+    a, b, c = joints
+    (ax, ay), (bx, by), (cx, cy) = true.feet
+    rod_a, rod_b, rod_c = (tower.rod_length for tower in true.towers)
+    return plant.Delta(
+        a=a.name,
+        ax=ax,
+        ay=ay,
+        rod_a=rod_a,
+        b=b.name,
+        bx=bx,
+        by=by,
+        rod_b=rod_b,
+        c=c.name,
+        cx=cx,
+        cy=cy,
+        rod_c=rod_c,
+    )
 
 
 def _coil(description: MachineDescription, settings: BedSettings, axes: Sequence[Axis]) -> Coil:

@@ -24,6 +24,7 @@ enum {
     PLANT_TERMS = 8,
     PLANT_SWITCHES = 16,
     PLANT_BEDS = 4,
+    PLANT_DELTAS = 1,
     PLANT_TMCS = 16,
     PLANT_TMC_EDGES = 96, // more than a datagram has
     PLANT_DIAGS = 16,
@@ -76,6 +77,13 @@ struct plant_axis {
     int term_count;
 };
 
+// A delta: three joints at x, y, whose heights are axes, hold the nozzle by rods (mm).
+struct plant_delta {
+    char name[PLANT_NAME];
+    int axes[3];
+    double x[3], y[3], rod[3];
+};
+
 // The height of a bed at x, y: z + tilt_x·(x - x0) + tilt_y·(y - y0)
 // + bow·(1 - ((x - x0)² + (y - y0)²) / radius²), so that a bowed bed is highest, or lowest, at x0, y0.
 struct plant_bed {
@@ -97,13 +105,14 @@ struct plant_bltouch {
 // A probe is a switch that the bed presses: it is at OFFSET_X, OFFSET_Y from the nozzle, and pressed when the
 // nozzle is OFFSET_Z above the bed there, or lower. The height of the nozzle is that of AXIS; with slopes
 // (mm per mm, axes as well; -1: none) that height is of x = y = 0 and grows along x and y. A twisted axis
-// makes OFFSET_Z grow by LEAN_X and LEAN_Y per mm that the probe is away from x0, y0 of the bed.
+// makes OFFSET_Z grow by LEAN_X and LEAN_Y per mm that the probe is away from x0, y0 of the bed. The nozzle
+// of a DELTA (-1: none) is where its rods hold it.
 struct plant_switch {
     char name[PLANT_NAME];
     int pin, axis, direction, inverted;
     double at, hysteresis, noise;
     int bed; // of a probe; -1: it is an endstop
-    int x_axis, y_axis, slope_x_axis, slope_y_axis;
+    int x_axis, y_axis, slope_x_axis, slope_y_axis, delta;
     double offset_x, offset_y, offset_z, lean_x, lean_y;
     int control_pin; // of a probe with a pin that a servo's signal moves; -1: it has none
     struct plant_bltouch bltouch;
@@ -239,7 +248,8 @@ struct plant {
     // Whether its level matters, whether more than that happens when it changes, whether the plant drives it.
     uint8_t cares[PLANT_PINS], writes[PLANT_PINS], reads[PLANT_PINS];
     int peer_count, stepper_count, axis_count, switch_count, body_count, couple_count, cooling_count;
-    int heater_count, fan_count, sensor_count, zone_count, tmc_count, diag_count, bed_count, coil_count;
+    int heater_count, fan_count, sensor_count, zone_count, tmc_count, diag_count, bed_count, coil_count,
+        delta_count;
     int first_heater, first_fan, first_sensor, first_switch, first_tmc,
         first_coil; // their first items in the page
     struct plant_peer peers[PLANT_PEERS];
@@ -247,6 +257,7 @@ struct plant {
     struct plant_axis axes[PLANT_AXES];
     struct plant_switch switches[PLANT_SWITCHES];
     struct plant_bed beds[PLANT_BEDS];
+    struct plant_delta deltas[PLANT_DELTAS];
     struct plant_coil coils[PLANT_COILS];
     struct plant_tmc tmcs[PLANT_TMCS];
     struct plant_diag diags[PLANT_DIAGS];
@@ -296,6 +307,8 @@ void plant_steps_lost(struct plant *plant, uint64_t ns, int stepper, uint64_t st
 double plant_probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns);
 double plant_probe_depth_at(struct plant *plant, const struct plant_switch *it,
                             uint64_t ns); // also in the past
+// plant_delta.c: the nozzle's x, y and z by the heights of the joints.
+void plant_delta_nozzle(const struct plant_delta *delta, const double heights[3], double nozzle[3]);
 // plant_coil.c
 void plant_coil_start(struct plant_coil *coil);
 int plant_coil_ready(const struct plant *plant, const struct plant_coil *coil, uint64_t ns);

@@ -71,6 +71,10 @@ static int find_axis(const struct plant *plant, const char *name) {
     return find(plant->axes, plant->axis_count, sizeof(*plant->axes), name);
 }
 
+static int find_delta(const struct plant *plant, const char *name) {
+    return find(plant->deltas, plant->delta_count, sizeof(*plant->deltas), name);
+}
+
 static int find_bed(const struct plant *plant, const char *name) {
     return find(plant->beds, plant->bed_count, sizeof(*plant->beds), name);
 }
@@ -119,6 +123,8 @@ static int read_value(const struct plant *plant, const struct plant_field *field
         return (*(int *)out = find_axis(plant, text)) < 0 ? -1 : 0;
     case BED:
         return (*(int *)out = find_bed(plant, text)) < 0 ? -1 : 0;
+    case DELTA:
+        return (*(int *)out = find_delta(plant, text)) < 0 ? -1 : 0;
     case BODY:
         return (*(int *)out = plant_text_body(plant, text)) < 0 ? -1 : 0;
     case STEPPER:
@@ -137,6 +143,7 @@ static void describe(const struct plant_field *field, char *out) {
                                         [CURVE] = "beta, steinhart, rtd, linear or table",
                                         [AXIS] = "an axis described above",
                                         [BED] = "a bed described above",
+                                        [DELTA] = "a delta described above",
                                         [BODY] = "a body described above",
                                         [STEPPER] = "a stepper described above",
                                         [CHIP] = "tmc2208 or tmc2209"};

@@ -139,10 +139,17 @@ typedef double (*position_function)(struct plant *plant, int axis, uint64_t ns);
 
 static double probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns,
                           position_function position) {
-    double x = position(plant, it->x_axis, ns) + it->offset_x;
-    double y = position(plant, it->y_axis, ns) + it->offset_y;
-    double z = position(plant, it->axis, ns) + x * position(plant, it->slope_x_axis, ns) +
-               y * position(plant, it->slope_y_axis, ns);
+    double nozzle[3];
+    const struct plant_delta *delta = it->delta < 0 ? NULL : &plant->deltas[it->delta];
+    const int own[3] = {it->x_axis, it->y_axis, it->axis};
+    for (int i = 0; i < 3; i++)
+        nozzle[i] = position(plant, delta ? delta->axes[i] : own[i], ns);
+    if (delta)
+        plant_delta_nozzle(delta, nozzle, nozzle);
+    double x = nozzle[0] + it->offset_x;
+    double y = nozzle[1] + it->offset_y;
+    double z =
+        nozzle[2] + x * position(plant, it->slope_x_axis, ns) + y * position(plant, it->slope_y_axis, ns);
     const struct plant_bed *bed = &plant->beds[it->bed];
     double lean = it->lean_x * (x - bed->x0) + it->lean_y * (y - bed->y0);
     return bed_height(bed, x, y) + it->offset_z + lean - z;

@@ -120,7 +120,7 @@ static int read_switch(const struct plant_reader *reader, char *rest) {
     if (plant->switch_count == PLANT_SWITCHES)
         return plant_text_fail(reader, "switch", "too many");
     struct plant_switch *it = &plant->switches[plant->switch_count++];
-    it->bed = it->control_pin = -1;
+    it->bed = it->control_pin = it->delta = -1;
     return plant_text_fields(reader, FIELDS(fields), rest, it);
 }
 
@@ -146,14 +146,41 @@ static int read_bed(const struct plant_reader *reader, char *rest) {
     return 0;
 }
 
+static int read_delta(const struct plant_reader *reader, char *rest) {
+#define TOWER(number, a, ax, ay, rod_a)                                                                      \
+    {a, AXIS, AT(plant_delta, axes[number]), 0, 0, 0},                                                       \
+        {ax, NUMBER, AT(plant_delta, x[number]), -1e4, 1e4, 0},                                              \
+        {ay, NUMBER, AT(plant_delta, y[number]), -1e4, 1e4, 0},                                              \
+        {rod_a, NUMBER, AT(plant_delta, rod[number]), 1, 1e4, 0}
+    static const struct plant_field fields[] = {
+        {"name", NAME, AT(plant_delta, name), 0, 0, 0},
+        TOWER(0, "a", "ax", "ay", "rod_a"),
+        TOWER(1, "b", "bx", "by", "rod_b"),
+        TOWER(2, "c", "cx", "cy", "rod_c"),
+    };
+#undef TOWER
+    struct plant *plant = reader->plant;
+    if (plant->delta_count == PLANT_DELTAS)
+        return plant_text_fail(reader, "delta", "too many");
+    struct plant_delta *delta = &plant->deltas[plant->delta_count];
+    if (plant_text_fields(reader, FIELDS(fields), rest, delta))
+        return -1;
+    const double *x = delta->x, *y = delta->y;
+    if (fabs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])) < 1)
+        return plant_text_fail(reader, "delta", "its towers stand on one line");
+    plant->delta_count++;
+    return 0;
+}
+
 static int read_probe(const struct plant_reader *reader, char *rest) {
     static const struct plant_field fields[] = {
         {"name", NAME, AT(plant_switch, name), 0, 0, 0},
         {"pin", PIN, AT(plant_switch, pin), 0, 0, 0},
         {"bed", BED, AT(plant_switch, bed), 0, 0, 0},
-        {"x", AXIS, AT(plant_switch, x_axis), 0, 0, 0},
-        {"y", AXIS, AT(plant_switch, y_axis), 0, 0, 0},
-        {"z", AXIS, AT(plant_switch, axis), 0, 0, 0},
+        {"x", AXIS, AT(plant_switch, x_axis), 0, 0, 1},
+        {"y", AXIS, AT(plant_switch, y_axis), 0, 0, 1},
+        {"z", AXIS, AT(plant_switch, axis), 0, 0, 1},
+        {"delta", DELTA, AT(plant_switch, delta), 0, 0, 1},
         {"slope_x", AXIS, AT(plant_switch, slope_x_axis), 0, 0, 1},
         {"slope_y", AXIS, AT(plant_switch, slope_y_axis), 0, 0, 1},
         {"offset_x", NUMBER, AT(plant_switch, offset_x), -1e3, 1e3, 1},
@@ -170,9 +197,14 @@ static int read_probe(const struct plant_reader *reader, char *rest) {
     if (plant->switch_count == PLANT_SWITCHES)
         return plant_text_fail(reader, "probe", "too many switches");
     struct plant_switch *it = &plant->switches[plant->switch_count++];
+    it->x_axis = it->y_axis = it->axis = it->delta = -1;
     it->slope_x_axis = it->slope_y_axis = it->control_pin = -1;
     it->direction = -1;
-    return plant_text_fields(reader, FIELDS(fields), rest, it);
+    if (plant_text_fields(reader, FIELDS(fields), rest, it))
+        return -1;
+    int given = (it->x_axis >= 0) + (it->y_axis >= 0) + (it->axis >= 0);
+    return given == (it->delta < 0 ? 3 : 0) ? 0
+                                            : plant_text_fail(reader, it->name, "needs x, y and z, or delta");
 }
 
 static int read_coil(const struct plant_reader *reader, char *rest) {
@@ -203,7 +235,8 @@ static int read_coil(const struct plant_reader *reader, char *rest) {
     if (plant->coil_count == PLANT_COILS)
         return plant_text_fail(reader, "coil", "too many");
     struct plant_coil *coil = &plant->coils[plant->coil_count++];
-    coil->intb_pin = coil->body = coil->place.slope_x_axis = coil->place.slope_y_axis = -1;
+    coil->intb_pin = coil->body = coil->place.slope_x_axis = coil->place.slope_y_axis = coil->place.delta =
+        -1;
     coil->drive = 15;
     coil->clock = 12e6;
     coil->far = 3e6;
@@ -415,7 +448,7 @@ static int read_line(const struct plant_reader *reader, char *line) {
         {"fan", read_fan},       {"couple", read_couple},   {"cooling", read_cooling},
         {"heater", read_heater}, {"sensor", read_sensor},   {"point", read_point},
         {"tmc", read_tmc},       {"diag", read_diag},       {"bed", read_bed},
-        {"probe", read_probe},   {"coil", read_coil},
+        {"probe", read_probe},   {"coil", read_coil},       {"delta", read_delta},
     };
     line += strspn(line, " \t\r");
     if (!*line || *line == '#')

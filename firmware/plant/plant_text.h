@@ -5,7 +5,7 @@
 
 #include "plant/plant.h"
 
-enum plant_type { NAME, PIN, FLAG, SIGN, WHOLE, NUMBER, CURVE, AXIS, BED, BODY, STEPPER, CHIP };
+enum plant_type { NAME, PIN, FLAG, SIGN, WHOLE, NUMBER, CURVE, AXIS, BED, DELTA, BODY, STEPPER, CHIP };
 
 struct plant_field {
     const char *name;

@@ -95,19 +95,40 @@ class Bed:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Delta:
+    """A delta: joints at fixed X and Y, whose heights are axes A, B and C, hold the nozzle by rods."""
+
+    name: str = "delta"
+    a: str
+    ax: float
+    ay: float
+    rod_a: float
+    b: str
+    bx: float
+    by: float
+    rod_b: float
+    c: str
+    cx: float
+    cy: float
+    rod_c: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Probe:
     """A switch at the head that BED presses: pressed while the nozzle is OFFSET_Z above the bed, or lower.
 
-    OFFSET_X, OFFSET_Y: its place from the nozzle. X, Y and Z are axes; where SLOPE_X and SLOPE_Y are axes as
-    well (mm per mm), Z is the nozzle's height at x = y = 0. Hysteresis and noise as of a switch.
+    OFFSET_X, OFFSET_Y: its place from the nozzle. X, Y and Z are axes, or DELTA has the nozzle; where SLOPE_X
+    and SLOPE_Y are axes as well (mm per mm), Z is the nozzle's height at x = y = 0. Hysteresis and noise as
+    of a switch.
     """
 
     name: str
     pin: str
     bed: str
-    x: str
-    y: str
-    z: str
+    x: str | None = None
+    y: str | None = None
+    z: str | None = None
+    delta: str | None = None
     slope_x: str | None = None
     slope_y: str | None = None
     offset_x: float = 0.0
@@ -330,6 +351,7 @@ class NodePlant:
     axes: tuple[Axis, ...] = ()
     switches: tuple[Switch, ...] = ()
     beds: tuple[Bed, ...] = ()
+    deltas: tuple[Delta, ...] = ()
     probes: tuple[Probe, ...] = ()
     coils: tuple[Coil, ...] = ()
     tmcs: tuple[Tmc, ...] = ()
@@ -369,7 +391,8 @@ class NodePlant:
                 fields = {"axis": axis.name, "node": self._short(term.node), "stepper": term.stepper}
                 yield _line("term", fields | {"mm": term.mm_per_step})
         for kind, parts in (
-            *(("switch", self.switches), ("bed", self.beds), ("probe", self.probes), ("tmc", self.tmcs)),
+            *(("switch", self.switches), ("bed", self.beds), ("delta", self.deltas)),
+            *(("probe", self.probes), ("tmc", self.tmcs)),
             *(("diag", self.diags), ("body", self.bodies), ("couple", self.couples), ("fan", self.fans)),
             *(("cooling", self.coolings), ("heater", self.heaters), ("coil", self.coils)),
         ):

@@ -1,9 +1,9 @@
 """DELTA_CALIBRATE and DELTA_ANALYZE on a simulated delta that differs from its configuration by known errors.
 
-Switches and motors are simulated; where the nozzle is follows from the carriages by the true figures.
+Switches and motors are simulated; where the nozzle is follows from the carriages by the true figures, also
+for the plant's probe.
 """
 
-import asyncio
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,23 +11,32 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.assembly.load import load_machine
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.kinematics.delta import Delta
 from coordinator.modules.levelling.delta_fit import Ways, nozzle_at, ways_at
 from coordinator.support.examples import EXAMPLES
+from coordinator.virtual_machine.plant_bed import BedSettings
 from tests.stages.plant_stage import PlantStage
-from tests.stages.served import running
 
 WIDTH_MM = 9.05
 PILLARS = [(0.0, 0.0)] + [
     (65 * math.cos(math.radians(210 + 60 * i)), 65 * math.sin(math.radians(210 + 60 * i))) for i in range(6)
 ]
 WITHIN_MM = 0.010
+PROBE = """
+[probe]
+pin: ^PG3
+z_offset: 1.5
+x_offset: 12
+y_offset: -7
+speed: 5
+"""
 
 
-def truth(configured: Delta) -> Delta:
-    """Return what the machine really is."""
-    errors = ((0.4, 0.7, 0.5), (-0.5, -0.9, -0.6), (0.0, 0.2, 0.3))
+def truth(configured: Delta, rods: float = 1.0) -> Delta:
+    """Return what the machine really is; RODS: share of the errors of its rods."""
+    errors = ((0.4, 0.7, 0.5 * rods), (-0.5, -0.9, -0.6 * rods), (0.0, 0.2, 0.3 * rods))
     a, b, c = (
         replace(
             tower,
@@ -40,23 +49,26 @@ def truth(configured: Delta) -> Delta:
     return replace(configured, radius=configured.radius + 1.2, towers=(a, b, c))
 
 
-def machine(folder: Path) -> Path:
-    """Return the example with fine steps, so that they matter less than what is to be found."""
+def machine(folder: Path, probe: str = "") -> Path:
+    """Return the example with fine steps, so that they matter less than what is to be found, and PROBE."""
     text = (EXAMPLES / "delta.cfg").read_text(encoding="utf-8")
     text = text.replace("microsteps: 16\nrotation_distance: 40", "microsteps: 128\nrotation_distance: 40")
     path = folder / "delta.cfg"
-    path.write_text(text + "[delta_calibrate]\nradius: 110\nspeed: 100\nhorizontal_move_z: 1.5\n")
+    height = 8 if probe else 1.5
+    section = f"[delta_calibrate]\nradius: 110\nspeed: 100\nhorizontal_move_z: {height}\n"
+    path.write_text(text + section + probe)
     return path
 
 
 class Bench:
     """The machine, and someone who sees where its nozzle really is."""
 
-    def __init__(self, folder: Path) -> None:
-        self.stage = PlantStage(folder, machine(folder), (0.0, 0.0, 399.0))
-        configured = self.stage.description.kinematics
+    def __init__(self, folder: Path, probe: str = "") -> None:
+        path = machine(folder, probe)
+        configured = load_machine(str(path)).kinematics
         assert isinstance(configured, Delta)
-        self.configured, self.true = configured, truth(configured)
+        self.configured, self.true = configured, truth(configured, rods=0.0 if probe else 1.0)
+        self.stage = PlantStage(folder, path, (0.0, 0.0, 399.0), bed=BedSettings(delta=self.true))
 
     async def run(self, script: str) -> list[str]:
         return list((await self.stage.served.call("gcode.run", script=script))["replies"])
@@ -94,13 +106,19 @@ class Bench:
 
 def test_planted_errors_are_found(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
+    bench.stage.serve(lambda: check(bench))
 
-    async def go() -> None:
-        async with running(bench.stage.served):
-            await check(bench)
 
-    with asyncio.Runner(loop_factory=bench.stage.stage.make_loop) as runner:
-        runner.run(go())
+def test_a_probe_finds_planted_errors(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, PROBE)
+
+    async def main() -> None:
+        await bench.run("G28\nG1 X0 Y0 Z10 F9000")
+        told = await bench.run("DELTA_CALIBRATE")
+        assert told[-1] == "SAVE_CONFIG writes them and restarts"
+        check_figures(bench)
+
+    bench.stage.serve(main)
 
 
 async def check(bench: Bench) -> None:

@@ -8,6 +8,7 @@ import pytest
 from coordinator.kinematics.base import Point
 from coordinator.simulate.scenario import NodeSetting
 from coordinator.virtual_machine.plant import PlantSettings
+from coordinator.virtual_machine.plant_bed import BedSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from tests.stages.machine_stage import MachineStage
 from tests.stages.safety_rig import MACHINE, START
@@ -27,9 +28,12 @@ class PlantStage(MachineStage):
         *,
         nodes: Mapping[str, NodeSetting] | None = None,
         heat: HeatSettings | None = None,
+        bed: BedSettings | None = None,
         **skew_mm: float,
     ) -> None:
-        plant = PlantSettings(start=start, skew_mm=skew_mm, heat=heat or HeatSettings())
+        plant = PlantSettings(
+            start=start, skew_mm=skew_mm, heat=heat or HeatSettings(), bed=bed or BedSettings()
+        )
         super().__init__(machine, seed=3, nodes=nodes, plant=plant)
         self._highest_mm = 0.0
         self.served = Served(folder, lambda: self.description, self.host)

@@ -361,6 +361,12 @@ static void test_what_is_no_plant(void) {
          "line 5: s: a table whose temperatures do not rise"},
         {"plant node=n\nbody name=b capacity=1 loss=1\nsensor name=s pin=PB0 node=- body=b curve=round\n",
          "expected beta, steinhart, rtd, linear or table"},
+        {"plant node=n\nbed name=b\nprobe name=p pin=PB0 bed=b\n", "p: needs x, y and z, or delta"},
+        {"plant node=n\nbed name=b\nprobe name=p pin=PB0 bed=b delta=d\n",
+         "expected a delta described above"},
+        {"plant node=n\naxis name=a\ndelta name=d a=a b=a c=a ax=0 ay=0 bx=50 by=50 cx=99 cy=99 rod_a=200 "
+         "rod_b=200 rod_c=200\n",
+         "its towers stand on one line"},
     };
     struct rig *rig = calloc(1, sizeof(*rig));
     CHECK(rig);

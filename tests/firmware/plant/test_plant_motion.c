@@ -5,6 +5,7 @@
 #include "plant/plant.h"
 #include "tests/check.h"
 
+#include <math.h>
 #include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
@@ -171,6 +172,40 @@ static void test_a_bed_presses_the_probe(void) {
     free(rig);
 }
 
+// A delta whose rods and towers are all different; a step of one joint moves its nozzle sideways, too.
+static void test_rods_hold_the_nozzle_of_a_delta(void) {
+    struct rig *rig = new_rig("plant node=n\n"
+                              "stepper name=both step=PA5 dir=PA6 both_edges=1\n"
+                              "axis name=a origin=231.4534963619511\n"
+                              "axis name=b origin=249.07925552553186\n"
+                              "axis name=c origin=226.7409216035368\n"
+                              "term axis=c node=- stepper=both mm=0.001\n"
+                              "delta name=d a=a b=b c=c ax=-87 ay=-50 bx=88 by=-51 cx=1 cy=102 "
+                              "rod_a=250 rod_b=260 rod_c=255\n"
+                              "bed name=bed tilt_x=0.5 tilt_y=-0.25\n"
+                              "probe name=p pin=PB0 bed=bed delta=d offset_x=2 offset_y=1\n");
+    double heights[3], nozzle[3];
+    for (int i = 0; i < 3; i++)
+        heights[i] = plant_axis_position(&rig->plant, &rig->plant.axes[i], 0);
+    plant_delta_nozzle(&rig->plant.deltas[0], heights, nozzle);
+    const double wanted[3] = {10, -20, 3};
+    for (int i = 0; i < 3; i++)
+        CHECK(fabs(nozzle[i] - wanted[i]) < 1e-9);
+    // The bed is at 6 - (-4.75) = 10.75 there: it presses until the nozzle is that high.
+    CHECK(fabs(plant_probe_depth(&rig->plant, &rig->plant.switches[0], 0) - 7.75) < 1e-9);
+    steps_both(rig, 1000);
+    heights[2] += 1;
+    plant_delta_nozzle(&rig->plant.deltas[0], heights, nozzle);
+    for (int i = 0; i < 3; i++) {
+        double x = rig->plant.deltas[0].x[i] - nozzle[0], y = rig->plant.deltas[0].y[i] - nozzle[1];
+        double rod = rig->plant.deltas[0].rod[i], z = heights[i] - nozzle[2];
+        CHECK(fabs(x * x + y * y + z * z - rod * rod) < 1e-6 && z > 0);
+    }
+    double bed = 0.5 * (nozzle[0] + 2) - 0.25 * (nozzle[1] + 1);
+    CHECK(fabs(plant_probe_depth(&rig->plant, &rig->plant.switches[0], rig->ns) - (bed - nozzle[2])) < 1e-9);
+    free(rig);
+}
+
 static void test_noise_moves_the_switch_between_approaches(void) {
     struct rig *rig = new_rig("plant node=n seed=3\n"
                               "stepper name=both step=PA5 dir=PA6 both_edges=1\n"
@@ -290,6 +325,7 @@ int main(void) {
     test_a_switch_with_travel_and_stops();
     test_two_switches_on_one_pin();
     test_a_bed_presses_the_probe();
+    test_rods_hold_the_nozzle_of_a_delta();
     test_noise_moves_the_switch_between_approaches();
     test_an_axis_of_two_other_nodes();
     test_history_wraps();
