@@ -1,16 +1,17 @@
-"""[z_tilt] and [quad_gantry_level] on a frame whose motors begin up to 3 mm off, above a virtual bed.
+"""[z_tilt], [z_tilt_ng], [quad_gantry_level] on a frame whose motors begin 3 mm off above a virtual bed.
 
 The truth is the plane through the heights at which the motors truly carry the frame.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from coordinator.config.errors import ConfigError
 from coordinator.virtual_machine.plant_bed import BedSettings
 from nodes.virtual.plant import Bed
 from tests.stages.printer_text import section
@@ -28,6 +29,7 @@ FOUR = {
 TILTED = Bed(z=0.2, x0=100, y0=100, tilt_x=0.002, tilt_y=-0.001)
 POINTS = {
     "z_tilt": "10, 90\n  170, 10\n  170, 180",
+    "z_tilt_ng": "10, 90\n  170, 10\n  170, 180",
     "quad_gantry_level": "5, 5\n  5, 180\n  175, 180\n  175, 5",
 }
 
@@ -39,11 +41,12 @@ def places(supports: Mapping[str, tuple[float, float]]) -> str:
 def levelling(kind: str, **options: Any) -> str:
     """Return the section KIND with OPTIONS."""
     own: dict[str, Any] = {"points": f"\n  {POINTS[kind]}", "horizontal_move_z": 7, "speed": 150}
-    if kind == "z_tilt":
+    if kind.startswith("z_tilt"):
         own["z_positions"] = f"\n  {places(THREE)}"
     else:
         own["gantry_corners"] = "\n  -10, -10\n  210, 210"
-    return section(kind, **own | {"retries": 3, "retry_tolerance": 0.005} | options)
+    own |= {"retries": 3, "retry_tolerance": 0.005} | options
+    return section(kind, **{name: value for name, value in own.items() if value is not None})
 
 
 def make(
@@ -55,7 +58,7 @@ def make(
     noise_mm: float = 0.0,
     **options: Any,
 ) -> ProbeStage:
-    supports = THREE if kind == "z_tilt" else FOUR
+    supports = THREE if kind.startswith("z_tilt") else FOUR
     bed = BedSettings(shape=shape, supports=supports, raised_mm=raised, noise_mm=noise_mm)
     text = machine_text(further_z=len(supports) - 1, sections=levelling(kind, **options))
     return ProbeStage(folder, text, bed=bed, start=START)
@@ -91,6 +94,7 @@ def passes(output: list[str]) -> int:
     [
         ("z_tilt", "Z_TILT_ADJUST", {"stepper_z1": 1.5, "stepper_z2": -1.5}),
         ("z_tilt", "Z_TILT_ADJUST", {"stepper_z": -3.0}),
+        ("z_tilt_ng", "Z_TILT_ADJUST", {"stepper_z1": 1.5, "stepper_z2": -1.5}),
         ("quad_gantry_level", "QUAD_GANTRY_LEVEL", {"stepper_z": -1.5, "stepper_z2": 1.5, "stepper_z3": 1.0}),
     ],
 )
@@ -162,6 +166,76 @@ def test_it_is_levelled_by_hand(tmp_path: Path) -> None:
 
     stage.run(main)
     assert gap_over_bed(stage) < 0.01
+
+
+# ------------------------------------------------------------------------------------------------ z_tilt_ng
+
+EXTRA = ((90.0, 20.0), (90.0, 160.0), (20.0, 20.0), (20.0, 170.0))
+BOWED = Bed(x0=100, y0=100, tilt_x=0.001, bow=0.3, radius=150)
+
+
+def unsaved(stage: ProbeStage) -> Mapping[str, str]:
+    assert stage.machine is not None
+    return stage.machine.unsaved.pending["z_tilt_ng"]
+
+
+def numbers(text: str) -> np.ndarray:
+    return np.array([[float(word) for word in line.split(",")] for line in text.strip().splitlines()])
+
+
+def uneven_mm(points: Sequence[tuple[float, float]]) -> np.ndarray:
+    """Return how far the bed at the first three POINTS of the nozzle is below the plane through all."""
+    at = [(x + OFFSET[0], y + OFFSET[1]) for x, y in points]
+    matrix = np.array([(1.0, x, y) for x, y in at])
+    z = np.array([bed_height(BOWED, x, y) for x, y in at])
+    return np.asarray((matrix @ np.linalg.lstsq(matrix, z, rcond=None)[0] - z)[:3])
+
+
+def test_few_points_level_as_well_as_many(tmp_path: Path) -> None:
+    extra = "\n  " + "\n  ".join(f"{x:g}, {y:g}" for x, y in EXTRA)
+    stage = make(tmp_path, "z_tilt_ng", {}, shape=BOWED, extra_points=extra, noise_mm=0.004)
+    output = stage.do("G28", "G1 Z9 F600", "Z_TILT_CALIBRATE AVGLEN=4", "Z_TILT_ADJUST RETRIES=0")
+    points = [tuple(point) for point in numbers(POINTS["z_tilt_ng"])]
+    wanted = uneven_mm([*points, *EXTRA])
+    assert np.abs(wanted).max() > 0.02
+    assert numbers(unsaved(stage)["z_offsets"])[0] == pytest.approx(wanted, abs=0.005)
+    assert len([text for text in output if text.startswith("probe at")]) % 7 == 3
+    # The frame follows the plane through all seven points now.
+    at = np.array([(x + OFFSET[0], y + OFFSET[1]) for x, y in (*points, *EXTRA)])
+    matrix = np.array([(1.0, x, y) for x, y in at])
+    z = np.array([bed_height(BOWED, x, y) for x, y in at])
+    slopes = np.linalg.lstsq(matrix, z, rcond=None)[0][1:]
+    assert frame(stage)[1:] == pytest.approx(tuple(slopes), abs=6e-5)
+
+
+def test_configured_offsets_count_for_the_spread_too(tmp_path: Path) -> None:
+    level = Bed(x0=100, y0=100)
+    stage = make(tmp_path, "z_tilt_ng", {}, shape=level, z_offsets="0.1, 0, 0", retries=0)
+    output = stage.do("G28", "G1 Z9 F600", "Z_TILT_ADJUST")
+    assert next(text for text in output if text.startswith("pass 1")).startswith(
+        "pass 1: the heights are 0.10"
+    )
+    (tmp_path / "wrong").mkdir()
+    with pytest.raises(ConfigError, match="2 heights, but there are 3 points"):
+        make(tmp_path / "wrong", "z_tilt_ng", {}, z_offsets="0.1, 0")
+
+
+@pytest.mark.parametrize("delta", ["", " DELTA=0.5"])
+def test_the_motors_are_found(tmp_path: Path, delta: str) -> None:
+    stage = make(tmp_path, "z_tilt_ng", {"stepper_z1": 1.0}, z_positions=None, autodetect_delta=2)
+    output = stage.do("G28", "G1 Z9 F600", f"Z_TILT_AUTODETECT{delta}", "Z_TILT_ADJUST")
+    by = delta.rpartition("=")[2] or "2"
+    assert [text for text in output if "raised" in text] == [f"{name} is raised by {by} mm" for name in THREE]
+    assert numbers(unsaved(stage)["z_positions"]) == pytest.approx(np.array(list(THREE.values())), abs=2.5)
+    assert passes(output) <= 3
+    assert gap_over_bed(stage) < 0.01
+
+
+def test_it_says_what_it_needs(tmp_path: Path) -> None:
+    stage = make(tmp_path, "z_tilt_ng", {}, z_positions=None)
+    said = failure(stage, "G28", "G1 Z9 F600", "Z_TILT_ADJUST")
+    assert "Z_TILT_ADJUST needs z_positions of [z_tilt_ng]; Z_TILT_AUTODETECT finds them" in said
+    assert "needs a probe" in failure(stage, "G28", "Z_TILT_CALIBRATE METHOD=manual")
 
 
 # ------------------------------------------------------------------------------------------ options, status

@@ -117,7 +117,14 @@ def test_the_page_tells_all_that_there_is(tmp_path: Path) -> None:
             kind = name.partition(" ")[0]
             assert set(keys.split()) == fields[kind], name
             seen.add(kind)
-        of_others = {"probe", "bed_mesh", "bed_screws", "screws_tilt_adjust", "z_tilt", "quad_gantry_level"}
+        of_others = {
+            "probe",
+            "bed_mesh",
+            "bed_screws",
+            "screws_tilt_adjust",
+            "z_tilt",
+            "quad_gantry_level",
+        } | {"z_tilt_ng"}
         elsewhere = {
             "gcode_macro",
             "extruder1",

@@ -114,12 +114,12 @@ class MotorLevelling(Module):
                 f"[{build.name}] needs two or more motors that move Z alone ([stepper_z1], …); add them, or"
                 " remove it",
             )
-        self._points = ProbePoints(build, places)
+        self.points = ProbePoints(build, places)
         self._retries, self._tolerance = build.get(RETRIES), build.get(RETRY_TOLERANCE)
         self._increasing = build.get(INCREASING)
         adaptive, least = build.get(ADAPTIVE), build.get(LEAST_HEIGHT)
         self._least_height = least if adaptive else None
-        self._probe: Probe | None = None
+        self.probe: Probe | None = None
         self._live: ModuleContext | None = None
         self.applied = False
         build.shared(MotorPower).when_off.append(self._off)
@@ -127,7 +127,7 @@ class MotorLevelling(Module):
 
     def link(self, modules: Modules) -> None:
         """Find the probe; raises NotSupported for one that does not act yet."""
-        self._probe = self._points.find_probe(modules)
+        self.probe = self.points.find_probe(modules)
 
     async def connect(self, live: ModuleContext) -> None:
         """Take over the machine."""
@@ -136,6 +136,10 @@ class MotorLevelling(Module):
     def status(self) -> Mapping[str, Value]:
         """Report whether it was done since the motors were switched on."""
         return {"applied": self.applied}
+
+    def corrected(self, measured: Sequence[Point]) -> list[Point]:
+        """Return MEASURED points of the bed as they count."""
+        return list(measured)
 
     @abstractmethod
     def heights(self, measured: Sequence[Point]) -> list[float]:
@@ -153,14 +157,12 @@ class MotorLevelling(Module):
     # ---------------------------------------------------------------------------------------------- passes
 
     def _read(self, call: Call) -> Reading:
-        how = how_to_measure(call, self._probe)
-        by = None if how is None or self._probe is None else (self._probe, how)
+        how = how_to_measure(call, self.probe)
+        by = None if how is None or self.probe is None else (self.probe, how)
         given = call.parameters("RETRIES", "RETRY_TOLERANCE")
         retries = round(bounded(call.command, given, "RETRIES", self._retries, low=0, high=1000))
         tolerance = bounded(call.command, given, "RETRY_TOLERANCE", self._tolerance, low=0, high=100)
-        self._points.check(call, None if by is None else by[0])
-        if missing := next((letter for letter in "XY" if letter not in call.homed), ""):
-            raise WordError(f"{call.command.name} comes before {missing} is homed; home with G28 first")
+        self.check_call(call, None if by is None else by[0])
         first = _Pass(call.command, retries, tolerance)
 
         def run(job: ProgramContext) -> Iterator[Reading]:
@@ -169,36 +171,42 @@ class MotorLevelling(Module):
 
         return Phases(run)
 
+    def check_call(self, call: Call, probe: Probe | None) -> None:
+        """Raise WordError where nothing can be measured, by PROBE or else by hand."""
+        self.points.check(call, probe)
+        if missing := next((letter for letter in "XY" if letter not in call.homed), ""):
+            raise WordError(f"{call.command.name} comes before {missing} is homed; home with G28 first")
+
     def _by_probe(
         self, job: ProgramContext, first: "_Pass", probe: Probe, how: Measuring
     ) -> Iterator[Reading]:
         now: _Pass | None = first
         while now is not None:
-            found = yield from self._points.measure(job, now.command, probe, how, height=now.height)
+            found = yield from self.points.measure(job, now.command, probe, how, height=now.height)
             if found is None:
                 return
             now = yield from self._level(job, now, found, how.lift_speed)
 
     def _by_hand(self, job: ProgramContext, now: "_Pass") -> Iterator[Reading]:
         def measured(job: ProgramContext, found: list[Measured]) -> Iterator[Reading]:
-            further = yield from self._level(job, now, found, self._points.speed)
+            further = yield from self._level(job, now, found, self.points.speed)
             if further is not None:
                 yield from self._by_hand(job, further)
 
-        yield from self._points.collect(job, job.call(now.command), None, measured)
+        yield from self.points.collect(job, job.call(now.command), None, measured)
 
     def _level(
         self, job: ProgramContext, now: "_Pass", found: Sequence[Measured], speed: float
     ) -> Generator[Reading, None, "_Pass | None"]:
         """Move the motors by what was FOUND, at SPEED; return the pass that follows, None: all is level."""
-        measured = [one.bed for one in found]
+        measured = self.corrected([one.bed for one in found])
         spread = spread_mm(measured)
         adjusts, mean = adjustments(self.heights(measured))
         yield Immediate((self._report(now.number, spread, adjusts),))
         if why := self.check(adjusts):
             raise WordError(f"{now.command.name} failed: {why}")
         call = job.call(now.command)
-        yield AtStandstill(lambda: self._adjust(call, adjusts, mean, speed))
+        yield AtStandstill(lambda: self.adjust(call, adjusts, mean, speed))
         if spread <= now.tolerance or now.retries == 0:
             self.applied = True
             return None
@@ -222,7 +230,7 @@ class MotorLevelling(Module):
         moves = ", ".join(f"{motor.name} {by:+.4f}" for motor, by in zip(self.motors, adjusts, strict=True))
         return f"pass {number}: the heights are {spread:.4f} mm apart; moves in mm: {moves}"
 
-    async def _adjust(self, call: Call, adjusts: Sequence[float], mean: float, speed: float) -> Done:
+    async def adjust(self, call: Call, adjusts: Sequence[float], mean: float, speed: float) -> Done:
         """Move the motors; return where the head is then.
 
         By a probe that is the endstop of Z the bed is at 0 then; else Z stays what it is.

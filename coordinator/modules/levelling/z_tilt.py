@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from typing import Final
 
+from coordinator.config.model import StepperDescription
 from coordinator.config.options import SectionSpec
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build
 from coordinator.modules.levelling.motor_levelling import OPTIONS, UNSUPPORTED, MotorLevelling
 from coordinator.modules.levelling.points import PlacesOption
-from coordinator.modules.levelling.surfaces import fit_plane, rank
+from coordinator.modules.levelling.surfaces import Place, fit_plane, rank
 
 POSITIONS: Final = PlacesOption(
     name="z_positions",
@@ -34,14 +35,19 @@ class ZTilt(MotorLevelling):
         places = build.get(POINTS)
         super().__init__(build, places)
         self._positions = build.get(POSITIONS)
-        if len(self._positions) != len(self.motors):
-            raise build.reader.bad(
-                POSITIONS, f"{len(self._positions)} places, but Z has {len(self.motors)} motors"
-            )
-        if rank(places) < rank(self._positions):
-            raise build.reader.bad(POINTS, "which lie on one line; the motors need places around it")
+        check_places(build, self._positions, places, self.motors)
 
     def heights(self, measured: Sequence[Point]) -> list[float]:
         """Return how high the plane through MEASURED is at each motor."""
         plane = fit_plane(measured)
         return [plane.height(position) for position in self._positions]
+
+
+def check_places(
+    build: Build, positions: Sequence[Place], points: Sequence[Place], motors: Sequence[StepperDescription]
+) -> None:
+    """Raise ConfigError unless POINTS tell how high each of the MOTORS at POSITIONS has to be."""
+    if len(positions) != len(motors):
+        raise build.reader.bad(POSITIONS, f"{len(positions)} places, but Z has {len(motors)} motors")
+    if rank(points) < rank(positions):
+        raise build.reader.bad(POINTS, "which lie on one line; the motors need places around it")

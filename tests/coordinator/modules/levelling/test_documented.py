@@ -17,19 +17,27 @@ SECTIONS = (
     section("bed_mesh", mesh_min="30, 30", mesh_max="150, 150")
     + section("screws_tilt_adjust", **SCREWS)
     + section("bed_screws", **SCREWS)
-    + section("z_tilt", z_positions=CORNERS, points=CORNERS)
+    + section("z_tilt_ng", z_positions=CORNERS, points=CORNERS)
     + section("quad_gantry_level", gantry_corners="0, 0\n  200, 200", points=CORNERS)
     + "[skew_correction]\n"
 )
 STATUS = (
-    *("bed_mesh", "manual_probe", "z_tilt", "quad_gantry_level", "screws_tilt_adjust", "bed_screws", "probe"),
+    *(
+        "bed_mesh",
+        "manual_probe",
+        "z_tilt_ng",
+        "quad_gantry_level",
+        "screws_tilt_adjust",
+        "bed_screws",
+        "probe",
+    ),
     "skew_correction",
 )
 MODULES = (
     "bed_mesh",
     "bed_screws",
     "screws_tilt_adjust",
-    "z_tilt",
+    "z_tilt_ng",
     "quad_gantry_level",
     "probe",
     "skew_correction",

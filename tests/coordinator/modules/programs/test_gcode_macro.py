@@ -383,6 +383,11 @@ mesh_max: 110, 120
 probe_count: 5
 faulty_region_1_min: 1, 2
 faulty_region_1_max: 3, 4
+[stepper_z1]
+step_pin: PE0
+dir_pin: PE1
+microsteps: 16
+rotation_distance: 8
 [z_tilt_ng]
 points:
     50, 25
