@@ -16,7 +16,6 @@ UNSUPPORTED_SECTIONS = frozenset(
         *_words("load_cell"),
         *_words("load_cell_probe"),
         *_words("dockable_probe z_calibration tools_calibrate"),
-        *_words("bed_tilt"),
         *_words("z_thermal_adjust endstop_phase"),
         *_words("gcode_shell_command sdcard_loop"),
         *_words("resonance_tester shaketune adxl345 icm20948 lis2dw lis3dh bmi160 mpu9250 angle"),

@@ -24,6 +24,7 @@ from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.parser import Command
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.motion.planner.planner import Planner
+from coordinator.motion.steps.surface import Surface
 
 Position = tuple[float, float, float, float]
 
@@ -170,6 +171,8 @@ class Vocabulary:
     ``[bed_mesh] is not supported yet``."""
     set_ups: "tuple[Callable[[Planner], None], ...]" = ()
     """Called for every program that begins."""
+    surface: Surface | None = None
+    """The shape of the bed that Z follows from the start; None: a plane."""
 
 
 NO_WORDS = Vocabulary({})

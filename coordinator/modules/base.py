@@ -26,6 +26,7 @@ from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.gcode.commands import Call, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, command_line
 from coordinator.motion.planner.planner import Planner
+from coordinator.motion.steps.surface import Surface
 from coordinator.runtime.machine import Modules
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import shown
@@ -140,6 +141,8 @@ class Build:
         self.replacements: list[tuple[GCodeCommand, str]] = []
         """Commands that may replace another one, and the new name of that one; empty: there is none."""
         self.set_ups: list[Callable[[Planner], None]] = []
+        self.surface: Surface | None = None
+        """The shape of the bed that Z follows from the start."""
         self.notes: list[str] = []
         self.unsupported = unsupported
         """Sections that nothing acts on yet."""

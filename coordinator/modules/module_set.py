@@ -29,6 +29,7 @@ from coordinator.modules.registry import module_for, option_readers
 from coordinator.modules.status.console import Console
 from coordinator.modules.status.positions import Positions
 from coordinator.motion.planner.planner import Planner
+from coordinator.motion.steps.surface import Surface
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
@@ -143,6 +144,7 @@ class ModuleSet:
         self._commands: dict[str, GCodeCommand] = {}
         self._owners: dict[str, str] = {}
         self._set_ups: list[Callable[[Planner], None]] = []
+        self._surface: Surface | None = None
         self._replacements: list[tuple[GCodeCommand, str, Build]] = []
         self.notes: list[str] = []
         """Sentences about what is no mistake."""
@@ -225,6 +227,7 @@ class ModuleSet:
                 )
             self._commands[command.name] = command
         self._set_ups += build.set_ups
+        self._surface = build.surface or self._surface
         self.notes += build.notes
         self._replacements += [(command, rename, build) for command, rename in build.replacements]
 
@@ -334,6 +337,7 @@ class ModuleSet:
             self._containing(self._disturbing()),
             self.unsupported,
             set_ups=tuple(self._set_ups),
+            surface=self._surface,
         )
 
     def _disturbing(self) -> set[str]:

@@ -66,7 +66,7 @@ def plan_file(options: PlanOptions, *, cache: DictionaryCache | None = None) -> 
             program,
             Planner(description.limits),
             description.homed_position,
-            machine_state(description),
+            machine_state(description, modules.vocabulary),
             modules.vocabulary,
         )
         pipeline = Pipeline(

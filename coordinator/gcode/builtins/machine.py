@@ -11,13 +11,21 @@ from dataclasses import replace
 from functools import partial
 
 from coordinator.gcode.commands import Phases, ProgramAction, ProgramContext, Reading
-from coordinator.gcode.events import PositionSet, Reply, ShaperChange, SmoothTimeChange, WeightsChange
+from coordinator.gcode.events import (
+    PositionSet,
+    Reply,
+    ShaperChange,
+    SmoothTimeChange,
+    SurfaceChange,
+    WeightsChange,
+)
 from coordinator.gcode.machine_state import DEFAULT_STATE, SHAPER_AXES, Extruder, MachineState, Shaper
 from coordinator.gcode.parameters import bounded, flag, needed
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.kinematics.dual_carriage import CarriageMode, CarriageState, DualCarriage
 from coordinator.motion.planner.planner import FeedStatus
 from coordinator.motion.steps.shapers import split_kind
+from coordinator.motion.steps.surface import Surface
 
 MAX_FREQUENCY_HZ = 1000.0
 MAX_ADVANCE_S = 10.0
@@ -34,6 +42,21 @@ def come_to_standstill(job: ProgramContext, settle_s: float = 0.0) -> bool:
     if not job.planner.flush():
         return False
     job.planner.dwell(max(settle_s, job.machine.settle_s()))
+    return True
+
+
+def follow_surface(job: ProgramContext, surface: Surface | None) -> bool:
+    """Let Z follow SURFACE from here on; no motor moves. False: call again."""
+    if not come_to_standstill(job, job.machine.settle_s()):
+        return False
+    planner = job.planner
+    motors = job.machine.motor_position(planner.toolhead_position)
+    job.machine.surface = surface
+    position = job.machine.planned_position(motors)
+    planner.set_position(position)
+    at_s = planner.print_time_end_s
+    job.emit(SurfaceChange(job.line, surface, at_s))
+    job.emit(PositionSet(job.line, "", position, at_s))
     return True
 
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.builtins.machine import come_to_standstill
+from coordinator.gcode.builtins.machine import follow_surface
 from coordinator.gcode.commands import (
     Call,
     Immediate,
@@ -17,7 +17,7 @@ from coordinator.gcode.commands import (
     ProgramContext,
     Reading,
 )
-from coordinator.gcode.events import PositionSet, Reply, SurfaceChange
+from coordinator.gcode.events import Reply
 from coordinator.gcode.parameters import bounded, flag, one, value
 from coordinator.gcode.parser import Command, WordError
 from coordinator.modules.base import Build, Module, Modules
@@ -138,8 +138,6 @@ class BedMesh(Module):
 
     def take(self, job: ProgramContext, mesh: Mesh | None, profile: str = "") -> bool:
         """Let Z follow MESH from here on; no motor moves. False: the planner has to be emptied first."""
-        if not come_to_standstill(job, job.machine.settle_s()):
-            return False
         surface = None
         if mesh is not None:
             assert self._settings is not None
@@ -147,19 +145,13 @@ class BedMesh(Module):
                 surface = mesh.surface(self._settings.fade.of(mesh, self._fade_offset), self._offset)
             except CanductorError as error:
                 raise WordError(str(error)) from None
-        planner = job.planner
-        motors = job.machine.motor_position(planner.toolhead_position)
-        job.machine.surface = surface
-        position = job.machine.planned_position(motors)
-        planner.set_position(position)
-        at_s = planner.print_time_end_s
-        job.emit(SurfaceChange(job.line, surface, at_s))
-        job.emit(PositionSet(job.line, "", position, at_s))
+        if not follow_surface(job, surface):
+            return False
         self._mesh, self._profile, self._surface = mesh, profile, surface
         self._fine = [[]] if mesh is None else _rows(mesh.fine_heights())
         if surface is not None:
             fastest = self._limits.max_z_velocity / max(surface.steepest, 1e-9)
-            if fastest < planner.max_velocity:
+            if fastest < job.planner.max_velocity:
                 job.emit(
                     Reply(
                         job.line,

@@ -171,7 +171,10 @@ class DeltaCalibrate(Module):
 
         def run(job: ProgramContext) -> Iterator[Reading]:
             if job.machine.surface is not None:
-                raise WordError(f"{call.command.name}: Z follows a mesh; BED_MESH_CLEAR comes first")
+                raise WordError(
+                    f"{call.command.name}: Z follows a mesh or a tilt; BED_MESH_CLEAR comes first, or"
+                    " remove [bed_tilt]"
+                )
             yield from self._points.collect(job, call, by, found)
 
         return Phases(run)

@@ -21,7 +21,7 @@ HALVED_MM: Final = 0.5
 """``+`` and ``-`` where nothing was tried yet on that side, halved."""
 SAME_MM: Final = 1e-6
 Then = Callable[[ProgramContext, Point], Iterator[Reading]]
-"""What follows when the nozzle is at the place that was found, mm."""
+"""What follows when the nozzle is at the place that was found: where the motors have it, mm."""
 _BEGUN: Final = "now move with TESTZ Z=-0.1 (+, -, ++, --) until it fits; end with ACCEPT or ABORT"
 
 
@@ -221,7 +221,7 @@ class ManualProbe(Module):
         return AtStandstill(accept)
 
     def _go_on(self, job: ProgramContext, then: Then) -> Iterator[Reading]:
-        x, y, z, _ = job.planner.toolhead_position
+        x, y, z, _ = job.machine.motor_position(job.planner.toolhead_position)
         self._accepted = self._then = None
         yield from then(job, (x, y, z))
 

@@ -43,7 +43,7 @@ class Motion:
         self.feeder = Feeder(
             Planner(described.limits),
             described.homed_position,
-            machine_state(described),
+            machine_state(described, machine.modules.vocabulary),
             machine.modules.vocabulary,
             has_jobs=has_jobs,
         )

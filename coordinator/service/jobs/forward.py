@@ -53,7 +53,7 @@ def read_forward(description: "MachineDescription", program: Program, end_bytes:
     """Read PROGRAM up to END_BYTES without doing anything; raises CanductorError. It may take a while."""
     modules = build_modules(description)
     planner = Planner(description.limits)
-    machine = machine_state(description)
+    machine = machine_state(description, modules.vocabulary)
     program.end_bytes = end_bytes
     objects = next(modules.of(ExcludeObject), None)
     if objects is not None:

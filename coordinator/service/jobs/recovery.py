@@ -19,6 +19,7 @@ from coordinator.gcode.parser import WordError, command_line
 from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.levelling.bed_mesh import RESTORE, BedMesh
+from coordinator.modules.levelling.bed_tilt import BedTilt
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
@@ -323,7 +324,10 @@ class Recovery:
 
 
 def _mesh(modules: Modules, motion: Motion) -> Mapping[str, Any]:
-    """Return the mesh that Z follows, and how much higher the head stands for it."""
+    """Return the mesh that Z follows, and how much higher the head stands for it, or for a tilt."""
+    if (tilt := next(modules.of(BedTilt), None)) is not None:
+        x, y, z, _ = (motion.trace.at(motion.now_s) or motion.planned).position
+        return {"bed_mm": tilt.added_mm((x, y, z))}
     mesh = next(modules.of(BedMesh), None)
     held = None if mesh is None else mesh.held()
     if mesh is None or held is None:
