@@ -162,6 +162,8 @@ class Vocabulary:
     too_cold: Callable[[str], bool] = lambda _extruder: False
     """Whether an extruder must not move filament now; asked before each piece of a program, in the reader's
     thread. One that is only planned is never too cold."""
+    z_shift: Callable[[float], float] | None = None
+    """Return by how much Z has to be higher for what is planned next at that Z, mm; asked as ``too_cold``."""
     interrupting: frozenset[str] = frozenset()
     """Commands that may pause or cancel a job: PAUSE, CANCEL_PRINT, and macros in which they come."""
     disturbing: frozenset[str] = frozenset()

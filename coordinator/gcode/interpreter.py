@@ -172,6 +172,9 @@ class Job(ProgramContext):
                 raise self._over.with_traceback(None)
             if self._over is not None:
                 return self._over
+            if (z_shift := self.vocabulary.z_shift) is not None:
+                planned_z = self.planner.toolhead_position[2] - self.planner.z_shift_mm
+                self.planner.z_shift_mm = z_shift(planned_z)
             filament = self.machine.filament
             self.planner.cold = self.vocabulary.too_cold(filament.active if filament is not None else "")
             try:

@@ -141,6 +141,8 @@ class Build:
         self.replacements: list[tuple[GCodeCommand, str]] = []
         """Commands that may replace another one, and the new name of that one; empty: there is none."""
         self.set_ups: list[Callable[[Planner], None]] = []
+        self.z_shift: Callable[[float], float] | None = None
+        """As of ``Vocabulary``."""
         self.surface: Surface | None = None
         """The shape of the bed that Z follows from the start."""
         self.notes: list[str] = []

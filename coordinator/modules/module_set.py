@@ -145,6 +145,7 @@ class ModuleSet:
         self._owners: dict[str, str] = {}
         self._set_ups: list[Callable[[Planner], None]] = []
         self._surface: Surface | None = None
+        self._z_shift: Callable[[float], float] | None = None
         self._replacements: list[tuple[GCodeCommand, str, Build]] = []
         self.notes: list[str] = []
         """Sentences about what is no mistake."""
@@ -228,6 +229,7 @@ class ModuleSet:
             self._commands[command.name] = command
         self._set_ups += build.set_ups
         self._surface = build.surface or self._surface
+        self._z_shift = build.z_shift or self._z_shift
         self.notes += build.notes
         self._replacements += [(command, rename, build) for command, rename in build.replacements]
 
@@ -333,6 +335,7 @@ class ModuleSet:
             self._commands,
             home if homing.acts else None,
             self._too_cold,
+            self._z_shift,
             self._containing(INTERRUPTING & self._commands.keys()),
             self._containing(self._disturbing()),
             self.unsupported,

@@ -55,6 +55,8 @@ class Homing(Module):
         self.corrected: Callable[[ReadHome], ReadHome] | None = None
         """Converts the result of homing, for programs whose X Y Z are not those of the axes."""
         self._probe: ProbeEndstop | None = None
+        self.when_homed: list[Callable[[str], None]] = []
+        """Called with the letters of the axes that are homed."""
         build.add_command("M119", "Report which endstops are pressed", self._read_query)
         build.add_command("QUERY_ENDSTOPS", "Report which endstops are pressed", self._read_query)
 
@@ -179,6 +181,8 @@ class Homing(Module):
             else:
                 place = found
         letters = "".join(letter for letter in "XYZ" if letter in homed)
+        for call_back in self.when_homed:
+            call_back(letters)
         place = await self._come_within(place, letters)
         return Done(position=(*place, e), homed=letters, moved=True, second_carriage_mm=second_mm)
 

@@ -102,6 +102,7 @@ class Planner:
         self._extruder_limits = limits
         """What was configured for the active extruder."""
         self._offset_mm = [0.0, 0.0, 0.0, 0.0]
+        self._z_shift_mm = 0.0
         self.set_arc_precision()
 
     # ---- Text in ----
@@ -250,9 +251,9 @@ class Planner:
 
     @property
     def gcode_base(self) -> Position:
-        """Machine position of the G-code origin."""
+        """Machine position of the G-code origin, but for ``z_shift_mm``."""
         x, y, z, e = self._state.base
-        return (x, y, z, e)
+        return (x, y, z - self._z_shift_mm, e)
 
     def set_gcode_position(self, words: Mapping[str, float]) -> None:
         """G92: the present position shall read as WORDS (axis letter to program units)."""
@@ -485,11 +486,26 @@ class Planner:
         for letter in axes:
             axis = AXES.index(letter)
             self._state.base[axis] = self._offset_mm[axis]
+            if letter == "Z":
+                self._z_shift_mm = 0.0
 
     def restore_origin(self, base: Position, offset: Position) -> None:
-        """Take back an origin (machine's frame, mm) and the offset that is in it."""
+        """Take back an origin (``gcode_base``, mm) and the offset that is in it."""
         self._state.base = base
+        self._state.base[2] += self._z_shift_mm
         self._offset_mm = list(offset)
+
+    @property
+    def z_shift_mm(self) -> float:
+        """How much higher moves are than the program says and ``gcode_base`` shows; homing Z ends it."""
+        return self._z_shift_mm
+
+    @z_shift_mm.setter
+    def z_shift_mm(self, shift_mm: float) -> None:
+        by_mm = shift_mm - self._z_shift_mm
+        self._z_shift_mm = shift_mm
+        self._state.base[2] += by_mm
+        self._state.position[2] += by_mm
 
     def shift_program(self, axis: str, distance_mm: float) -> None:
         """Add DISTANCE_MM along AXIS to the next move, without a move of its own."""
