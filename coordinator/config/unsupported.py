@@ -16,7 +16,6 @@ UNSUPPORTED_SECTIONS = frozenset(
         *_words("load_cell"),
         *_words("load_cell_probe"),
         *_words("dockable_probe z_calibration tools_calibrate"),
-        *_words("endstop_phase"),
         *_words("gcode_shell_command sdcard_loop"),
         *_words("resonance_tester shaketune adxl345 icm20948 lis2dw lis3dh bmi160 mpu9250 angle"),
         *_words("tmc2130 tmc2240 tmc2660 tmc5160 autotune_tmc ad5206 mcp4451 mcp4728 mcp4018 dac084S085"),

@@ -5,6 +5,7 @@ than the motors.
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,7 @@ class ProbeStage(MachineStage):
         bed: BedSettings | None = None,
         heat: HeatSettings | None = None,
         start: tuple[float, float, float] = START,
+        switch_noise_mm: float = 0.0,
     ) -> None:
         path = folder / "probe.cfg"
         path.write_text(text or machine_text(), encoding="utf-8")
@@ -99,6 +101,7 @@ class ProbeStage(MachineStage):
         """What is called when a line M118 says that."""
         self.machine: Machine | None = None
         plant = PlantSettings(seed=seed, start=start, bed=self.bed, heat=heat or HeatSettings())
+        plant = replace(plant, switch_noise_mm=switch_noise_mm)
         super().__init__(path, seed=seed, buses=buses, plant=plant)
 
     def do(self, *lines: str, on_ready: Callable[[Machine], None] = lambda _: None) -> list[str]:

@@ -10,7 +10,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
-from typing import Final
+from typing import Final, Protocol
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import MachineDescription, RailDescription
@@ -39,6 +39,16 @@ BELOW_MM: Final = 0.5
 ReadHome = Callable[[Call, str], Reading]
 
 
+class TriggerPhase(Protocol):
+    """What knows better at which step an endstop switched."""
+
+    async def before(self) -> None:
+        """Take note of how a stepper stands before a move towards its endstop; raises CanductorError."""
+
+    async def beyond_mm(self, result: HomingResult) -> float:
+        """Return by how much further beyond the trigger of RESULT the rail stands; raises CanductorError."""
+
+
 class Homing(Module):
     """Homes the machine that it is built for."""
 
@@ -55,6 +65,8 @@ class Homing(Module):
         self.corrected: Callable[[ReadHome], ReadHome] | None = None
         """Converts the result of homing, for programs whose X Y Z are not those of the axes."""
         self._probe: ProbeEndstop | None = None
+        self.trigger_phases: dict[str, TriggerPhase] = {}
+        """By the first stepper of a rail."""
         self.when_homed: list[Callable[[str], None]] = []
         """Called with the letters of the axes that are homed."""
         build.add_command("M119", "Report which endstops are pressed", self._read_query)
@@ -213,17 +225,29 @@ class Homing(Module):
         homing = rail.homing
         if await self._any_pressed([rail for rail in approach.rails if not self._feels(rail)]):
             await self._go_back(approach)
-        results = await self._move(approach, approach.most_mm, homing.speed)
+        most_mm, speed = approach.most_mm, homing.speed
         if homing.retract_distance:
+            await self._move(approach, most_mm, speed)
             await self._go_back(approach)
-            most_mm = self._most_again_mm(rail)
-            results = await self._move(approach, most_mm, homing.second_speed)
-        beyond_mm = [result.beyond_trigger_mm for result in results]
+            most_mm, speed = self._most_again_mm(rail), homing.second_speed
+        beyond_mm = await self._beyond_mm(approach, most_mm, speed)
         if self._probe is not None and homing.by_probe:
             beyond_mm = await self._measured(approach, beyond_mm)
         if rail.axis in AXES:
             await self._align(approach, beyond_mm)
         return beyond_mm
+
+    async def _beyond_mm(self, approach: Approach, way_mm: float, speed: float) -> list[float]:
+        """Go to the endstops for the last time; return how far beyond each trigger the rails stand."""
+        phases = [self.trigger_phases.get(rail.steppers[0].name) for rail in approach.rails]
+        for phase in phases:
+            if phase is not None:
+                await phase.before()
+        results = await self._move(approach, way_mm, speed)
+        return [
+            result.beyond_trigger_mm + (0.0 if phase is None else await phase.beyond_mm(result))
+            for result, phase in zip(results, phases, strict=True)
+        ]
 
     async def _measured(self, approach: Approach, beyond_mm: list[float]) -> list[float]:
         """Return BEYOND_MM, or what follows from the height that the probe measures at standstill."""
