@@ -113,7 +113,7 @@ def test_txqueuelen(doctor: Command, length: int, name: str) -> None:
 @controls_interface
 @pytest.mark.usefixtures("node")
 def test_a_send_queue_that_is_full(doctor: Command) -> None:
-    with tiny_queue(rate_kbit=16):
+    with tiny_queue(rate_kbit=1):  # so slow that a burst, however slowly it is sent, does not fit
         said = examine(doctor, *SHORTLY)
     assert said.status == 1
     assert "send-queue-full" in problems(said), said.out
