@@ -80,7 +80,8 @@ class MotionWorker:
         self._batches: list[tuple[int, bytes]] = []
         self.began_at: dict[str, int] = {}
         """By stepper: steps that its node counted when motion last started."""
-        self.maps: list[ClockMap] = []
+        now_s = self._time_base.print_time_at(machine.host.now())
+        self.maps: list[ClockMap] = [machine.clock_map(self._time_base, node, now_s) for node in self._nodes]
         """Per moving node: print time to ticks, as the steps were timed; without a record only its end."""
         self.start_lead_s = START_LEAD_S
         self.held: str | None = None
