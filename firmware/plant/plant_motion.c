@@ -140,12 +140,12 @@ typedef double (*position_function)(struct plant *plant, int axis, uint64_t ns);
 static double probe_depth(struct plant *plant, const struct plant_switch *it, uint64_t ns,
                           position_function position) {
     double nozzle[3];
-    const struct plant_delta *delta = it->delta < 0 ? NULL : &plant->deltas[it->delta];
     const int own[3] = {it->x_axis, it->y_axis, it->axis};
+    const int *axes = it->delta < 0 ? own : plant->deltas[it->delta].axes;
     for (int i = 0; i < 3; i++)
-        nozzle[i] = position(plant, delta ? delta->axes[i] : own[i], ns);
-    if (delta)
-        plant_delta_nozzle(delta, nozzle, nozzle);
+        nozzle[i] = position(plant, axes[i], ns);
+    if (it->delta >= 0)
+        plant_delta_nozzle(&plant->deltas[it->delta], nozzle, nozzle);
     double x = nozzle[0] + it->offset_x;
     double y = nozzle[1] + it->offset_y;
     double z =
