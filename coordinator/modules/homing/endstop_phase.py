@@ -1,10 +1,10 @@
 """[endstop_phase STEPPER]: an endstop that is exact to a step, by the phase of its motor's driver.
 
 A switch closes at about the same place, and within an electrical cycle of the motor (four full steps) the
-phase of the driver tells exactly which of its steps that was. What it deviates from the phase that is
+phase of the driver identifies the step exactly. Its deviation from the phase that is
 expected is taken off: homing then repeats to the step, as long as the switch is good for half a cycle.
 
-A driver on a UART tells its phase (MSCNT); of any other one the steps that the node has counted since its
+A driver on a UART reports its phase (MSCNT); of any other one the steps that the node has counted since its
 reset are taken for it, which is right for as long as the driver keeps its supply.
 """
 
@@ -94,8 +94,8 @@ class EndstopPhases(Module):
     def _read(self, call: Call) -> Reading:
         given = call.parameters("STEPPER")
         if "STEPPER" not in given:
-            told = [self._told(name) for name in self.found]
-            return Immediate(tuple(told) or ("no axis was homed yet",))
+            reports = [self._report(name) for name in self.found]
+            return Immediate(tuple(reports) or ("no axis was homed yet",))
         name = given["STEPPER"].lower()
         if name not in self.found:
             hint = nearest_or_all(name, self.found) if self.found else "; none was homed yet"
@@ -110,9 +110,9 @@ class EndstopPhases(Module):
                 live.soon_on_loop(lambda: live.save(section, TRIGGER_PHASE.name, text))
 
         said = f"{name}: {TRIGGER_PHASE.name} is {text}; SAVE_CONFIG writes it"
-        return Immediate((self._told(name), said), keep)
+        return Immediate((self._report(name), said), keep)
 
-    def _told(self, name: str) -> str:
+    def _report(self, name: str) -> str:
         counter, stepper = self.found[name], self._steppers[name]
         phases = phases_of(stepper)
         middle = middle_phase(counter, phases)

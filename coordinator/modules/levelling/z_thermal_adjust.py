@@ -145,8 +145,8 @@ class ZThermalAdjust(TemperatureSensor):
         def act() -> None:
             self._enabled, self._coeff, self._reference_c = enabled, coeff, reference
 
-        told = (
+        report = (
             f"enabled: {enabled}, temp_coeff: {coeff:g} mm/K, reference: {shown},"
             f" correction: {self._shift_mm:.4f} mm"
         )
-        return Immediate((told,), act)
+        return Immediate((report,), act)

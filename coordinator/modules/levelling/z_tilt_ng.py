@@ -238,7 +238,7 @@ class ZTiltNg(MotorLevelling):
 
 
 def find_motors(level: Plane, tilted: Sequence[Plane], delta: float) -> list[Place] | None:
-    """Return where three motors are that were raised by DELTA one after the other; None: nobody can tell.
+    """Return where three motors are that were raised by DELTA one after the other; None: it cannot be found.
 
     LEVEL: the bed before; TILTED: with each of them raised. A raised motor lets the bed seem lower.
     """
