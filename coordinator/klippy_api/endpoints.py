@@ -20,8 +20,8 @@ from coordinator.klippy_api.step_dump import HEADER as STEP_HEADER
 from coordinator.klippy_api.step_dump import StepDump
 from coordinator.klippy_api.subscription import Subscription, select_fields
 from coordinator.klippy_api.wire import Request
+from coordinator.modules.compensation.bed_mesh import BedMesh
 from coordinator.modules.homing.homing import Homing
-from coordinator.modules.levelling.bed_mesh import BedMesh
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.work import LINES_MAX

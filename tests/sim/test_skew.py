@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.modules.levelling.skew_correction import Skew
+from coordinator.modules.compensation.skew_correction import Skew
 from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served
 

@@ -1,1 +1,1 @@
-"""Corrections of a machine's geometry."""
+"""Making the machine itself straight: screws, Z motors, the geometry of a delta."""

@@ -13,8 +13,8 @@ from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.kinematics.base import Weights
 from coordinator.kinematics.generic_cartesian import GenericCartesian
 from coordinator.modules.base import Build, Module, Modules
+from coordinator.modules.compensation.skew_correction import Skew, Skews
 from coordinator.modules.homing.homing import Homing
-from coordinator.modules.levelling.skew_correction import Skew, Skews
 
 NAME = "SET_STEPPER_CARRIAGES"
 

@@ -36,8 +36,8 @@ from coordinator.gcode.parameters import bounded
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Modules
+from coordinator.modules.compensation.skew_correction import Skew, Skews
 from coordinator.modules.homing.virtual_endstop import ProbeEndstop
-from coordinator.modules.levelling.skew_correction import Skew, Skews
 from coordinator.modules.probes.samples import AVERAGE, MEDIAN, SampleRules, SampleSeries
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.runtime.module_context import ModuleContext

@@ -12,7 +12,7 @@ from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import SavedState
 from coordinator.gcode.parser import command_line
 from coordinator.gcode.program import Program
-from coordinator.modules.levelling.skew_correction import Skews
+from coordinator.modules.compensation.skew_correction import Skews
 from coordinator.modules.module_set import build_modules
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro

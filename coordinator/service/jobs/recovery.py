@@ -18,8 +18,8 @@ from coordinator.gcode.events import Event, Full, Notice
 from coordinator.gcode.parser import WordError, command_line
 from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError
-from coordinator.modules.levelling.bed_mesh import RESTORE, BedMesh
-from coordinator.modules.levelling.bed_tilt import BedTilt
+from coordinator.modules.compensation.bed_mesh import RESTORE, BedMesh
+from coordinator.modules.compensation.bed_tilt import BedTilt
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner

@@ -13,7 +13,7 @@ from coordinator.gcode.commands import Call, Immediate, Phases, ProgramAction, P
 from coordinator.gcode.parser import WordError
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.levelling.bed_mesh import BedMesh
+from coordinator.modules.compensation.bed_mesh import BedMesh
 from coordinator.modules.levelling.points import OPTIONS, PlacesOption, ProbePoints, how_to_measure
 from coordinator.modules.levelling.surfaces import Plane, fit_plane
 from coordinator.modules.probes.probe import Measured, Probe

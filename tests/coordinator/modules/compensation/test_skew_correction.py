@@ -8,7 +8,7 @@ import pytest
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
 from coordinator.gcode.events import PositionSet, WeightsChange
-from coordinator.modules.levelling.skew_correction import Skew, Skews
+from coordinator.modules.compensation.skew_correction import Skew, Skews
 from tests.stages.program_stage import ProgramStage
 
 PROFILE = "[skew_correction cold]\nxy_skew: 0.01\nxz_skew: -0.002\nyz_skew: 0.003\n"

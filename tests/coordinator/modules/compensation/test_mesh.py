@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from coordinator.modules.levelling.bed_mesh_options import Fade
-from coordinator.modules.levelling.mesh import (
+from coordinator.modules.compensation.bed_mesh_options import Fade
+from coordinator.modules.compensation.mesh import (
     BICUBIC,
     LAGRANGE,
     Grid,

@@ -21,7 +21,7 @@ from coordinator.gcode.events import Reply
 from coordinator.gcode.parameters import bounded, flag, one, value
 from coordinator.gcode.parser import Command, WordError
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.levelling.bed_mesh_options import (
+from coordinator.modules.compensation.bed_mesh_options import (
     BY_PROBE,
     PARAMETERS,
     PROFILE,
@@ -35,7 +35,7 @@ from coordinator.modules.levelling.bed_mesh_options import (
     read_profile,
     read_settings,
 )
-from coordinator.modules.levelling.mesh import Grid, Mesh, Place, adapted, fitting_algorithm
+from coordinator.modules.compensation.mesh import Grid, Mesh, Place, adapted, fitting_algorithm
 from coordinator.modules.levelling.points import ProbePoints, how_to_measure
 from coordinator.modules.probes.probe import Measured, Measuring, Probe
 from coordinator.modules.programs.exclude_object import ExcludeObject

@@ -12,7 +12,7 @@ from coordinator.config.options import BadValue, BoolOption, ChoiceOption, Float
 from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build
-from coordinator.modules.levelling.mesh import (
+from coordinator.modules.compensation.mesh import (
     BICUBIC,
     LAGRANGE,
     Floats,

@@ -1,0 +1,1 @@
+"""Corrections of positions while the machine moves: mesh, tilt, twist, skew, heat."""
