@@ -98,6 +98,9 @@ void plant_output(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
         for (int i = 0; i < plant->switch_count; i++)
             if (plant->switches[i].control_pin == (int)pin)
                 plant_bltouch_edge(plant, &plant->switches[i], ns, value);
+        for (int i = 0; i < plant->load_cell_count; i++)
+            if (plant->load_cells[i].sclk_pin == (int)pin)
+                plant_load_cell_edge(plant, &plant->load_cells[i], ns, value);
     }
     drive_pin(plant, ns, pin, value);
 }
@@ -241,6 +244,9 @@ int plant_input(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
     for (int i = 0; i < plant->coil_count; i++)
         if (plant->coils[i].intb_pin == (int)pin)
             return !plant_coil_ready(plant, &plant->coils[i], ns);
+    for (int i = 0; i < plant->load_cell_count; i++)
+        if (plant->load_cells[i].dout_pin == (int)pin)
+            return plant_load_cell_level(plant, &plant->load_cells[i], ns);
     int line = line_level(plant, ns, pin);
     if (line >= 0)
         return line;
@@ -281,10 +287,13 @@ static int has_same_steppers(const struct plant *plant, const struct plant_page 
 }
 
 // Of what was described last of all.
-static void add_coils(struct plant *plant, struct plant_page *page) {
+static void add_sensors_of_probes(struct plant *plant, struct plant_page *page) {
     plant->first_coil = (int)page->item_count;
     for (int i = 0; i < plant->coil_count; i++)
         add_item(page, PLANT_COIL, plant->coils[i].name);
+    plant->first_load_cell = (int)page->item_count;
+    for (int i = 0; i < plant->load_cell_count; i++)
+        add_item(page, PLANT_LOAD_CELL, plant->load_cells[i].name);
 }
 
 static void make_page(struct plant *plant, struct plant_page *page) {
@@ -313,7 +322,7 @@ static void make_page(struct plant *plant, struct plant_page *page) {
     plant->first_tmc = (int)page->item_count;
     for (int i = 0; i < plant->tmc_count; i++)
         add_item(page, PLANT_TMC, plant->tmcs[i].name);
-    add_coils(plant, page);
+    add_sensors_of_probes(plant, page);
     atomic_store(&page->horizon_ns, 0);
 }
 
@@ -345,6 +354,10 @@ static void note_pins(struct plant *plant) {
     for (int i = 0; i < plant->coil_count; i++)
         if (plant->coils[i].intb_pin >= 0)
             plant->reads[plant->coils[i].intb_pin] = 1;
+    for (int i = 0; i < plant->load_cell_count; i++) {
+        plant->reads[plant->load_cells[i].dout_pin] = 1;
+        plant->writes[plant->load_cells[i].sclk_pin] = 1;
+    }
     for (int pin = 0; pin < PLANT_PINS; pin++)
         plant->cares[pin] |= plant->writes[pin];
 }
@@ -374,6 +387,8 @@ void plant_start(struct plant *plant, struct plant_page *page, uint64_t ns) {
     make_page(plant, page);
     for (int i = 0; i < plant->coil_count; i++)
         plant_coil_start(&plant->coils[i]);
+    for (int i = 0; i < plant->load_cell_count; i++)
+        plant->load_cells[i].start_ns = plant->load_cells[i].woken_ns = ns;
     for (int i = 0; i < plant->tmc_count; i++)
         plant_tmc_start(plant, &plant->tmcs[i], ns);
     show(plant, ns);

@@ -30,6 +30,7 @@ enum {
     PLANT_DIAGS = 16,
     PLANT_COILS = 2,
     PLANT_COIL_REGISTERS = 128,
+    PLANT_LOAD_CELLS = 2,
     PLANT_BODIES = 12,
     PLANT_HEATERS = 12,
     PLANT_FANS = 12,
@@ -41,7 +42,7 @@ enum {
     PLANT_ERROR = 200,
 };
 _Static_assert(PLANT_BODIES + PLANT_HEATERS + PLANT_FANS + PLANT_SENSORS + PLANT_SWITCHES + PLANT_TMCS +
-                       PLANT_COILS <=
+                       PLANT_COILS + PLANT_LOAD_CELLS <=
                    PLANT_ITEMS,
                "all items have a place in the page");
 
@@ -134,6 +135,23 @@ struct plant_coil {
     int pointer;
     uint64_t woken_ns, taken; // readings that were read or missed
     uint32_t latched;
+};
+
+// A load cell that carries the nozzle, with its converter (plant_load_cell.c). PLACE: of the nozzle, by the
+// fields of a probe; without a bed (-1) nothing presses. A reading is zero + counts_per_gram · force, where
+// the force is stiffness times the depth, plus what drifts, and a hum.
+struct plant_load_cell {
+    char name[PLANT_NAME];
+    int dout_pin, sclk_pin;
+    struct plant_switch place;
+    double rate;                                 // conversions per second, as it truly is
+    double counts_per_gram, zero;                // counts
+    double stiffness, drift, hum;                // g/mm, g/s, g
+    double hum_hz, noise;                        // Hz, counts (standard deviation)
+    uint64_t start_ns, woken_ns, rise_ns, taken; // conversions that were read or missed
+    uint32_t shown;                              // what is shifted out
+    int pulses;                                  // of SCLK since it was latched
+    int gain;                                    // which the last pulses have chosen
 };
 
 // A driver TMC2209, or without StallGuard a TMC2208, of a stepper whose axes count MICROSTEPS to a full step.
@@ -249,9 +267,9 @@ struct plant {
     uint8_t cares[PLANT_PINS], writes[PLANT_PINS], reads[PLANT_PINS];
     int peer_count, stepper_count, axis_count, switch_count, body_count, couple_count, cooling_count;
     int heater_count, fan_count, sensor_count, zone_count, tmc_count, diag_count, bed_count, coil_count,
-        delta_count;
-    int first_heater, first_fan, first_sensor, first_switch, first_tmc,
-        first_coil; // their first items in the page
+        delta_count, load_cell_count;
+    int first_heater, first_fan, first_sensor, first_switch, first_tmc, first_coil,
+        first_load_cell; // their first items in the page
     struct plant_peer peers[PLANT_PEERS];
     struct plant_stepper steppers[PLANT_STEPPERS];
     struct plant_axis axes[PLANT_AXES];
@@ -259,6 +277,7 @@ struct plant {
     struct plant_bed beds[PLANT_BEDS];
     struct plant_delta deltas[PLANT_DELTAS];
     struct plant_coil coils[PLANT_COILS];
+    struct plant_load_cell load_cells[PLANT_LOAD_CELLS];
     struct plant_tmc tmcs[PLANT_TMCS];
     struct plant_diag diags[PLANT_DIAGS];
     struct plant_body bodies[PLANT_BODIES];
@@ -312,6 +331,9 @@ void plant_delta_nozzle(const struct plant_delta *delta, const double heights[3]
 // plant_coil.c
 void plant_coil_start(struct plant_coil *coil);
 int plant_coil_ready(const struct plant *plant, const struct plant_coil *coil, uint64_t ns);
+// plant_load_cell.c
+void plant_load_cell_edge(struct plant *plant, struct plant_load_cell *cell, uint64_t ns, int level);
+int plant_load_cell_level(struct plant *plant, const struct plant_load_cell *cell, uint64_t ns);
 // plant_bltouch.c
 void plant_bltouch_edge(struct plant *plant, struct plant_switch *it, uint64_t ns, int level);
 int plant_bltouch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns, uint32_t fault);

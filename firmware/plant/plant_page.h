@@ -28,6 +28,7 @@ enum plant_kind {
     PLANT_SWITCH,
     PLANT_TMC,
     PLANT_COIL,
+    PLANT_LOAD_CELL,
 };
 
 // What can be wrong with an item, by its kind.
@@ -49,6 +50,8 @@ enum plant_fault {
     PLANT_GARBLED,
     PLANT_WARM,
     PLANT_OVERHEATED,
+    // A load cell: OPEN or DEAD, its chip makes no readings; SHORTED, they are at full scale; NEVER, it feels
+    // nothing of the bed.
     // A coil: OPEN, its chip does not answer; DEAD, it makes no readings; SHORTED, it flags them as bad.
     // A switch stays as it is, of a BLTouch the pin; it closes a fifth of a millimetre late.
     PLANT_STUCK,
@@ -72,7 +75,8 @@ struct plant_page_stepper {
 // value and extra are doubles, as bits: of a body °C; of a heater its duty (0..1) and the heat it gave (J);
 // of a fan its duty and the turns it made; of a sensor the °C it has and what its converter last gave; of a
 // switch whether it is pressed and how often it has switched; of a driver the time (ns) until which its DIAG
-// is high when no step follows, and its SG_RESULT; of a coil the frequency of its last reading (Hz).
+// is high when no step follows, and its SG_RESULT; of a coil the frequency of its last reading (Hz);
+// of a load cell the force of its last one (g).
 struct plant_page_item {
     char name[PLANT_NAME];
     uint32_t kind;

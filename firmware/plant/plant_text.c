@@ -245,6 +245,38 @@ static int read_coil(const struct plant_reader *reader, char *rest) {
     return plant_text_fields(reader, FIELDS(fields), rest, coil);
 }
 
+static int read_load_cell(const struct plant_reader *reader, char *rest) {
+    static const struct plant_field fields[] = {
+        {"name", NAME, AT(plant_load_cell, name), 0, 0, 0},
+        {"dout", PIN, AT(plant_load_cell, dout_pin), 0, 0, 0},
+        {"sclk", PIN, AT(plant_load_cell, sclk_pin), 0, 0, 0},
+        {"rate", NUMBER, AT(plant_load_cell, rate), 1, 1000, 0},
+        {"counts_per_gram", NUMBER, AT(plant_load_cell, counts_per_gram), -1e5, 1e5, 1},
+        {"zero", NUMBER, AT(plant_load_cell, zero), -8e6, 8e6, 1},
+        {"stiffness", NUMBER, AT(plant_load_cell, stiffness), 1, 1e6, 1},
+        {"drift", NUMBER, AT(plant_load_cell, drift), -1e3, 1e3, 1},
+        {"hum", NUMBER, AT(plant_load_cell, hum), 0, 1e4, 1},
+        {"hum_hz", NUMBER, AT(plant_load_cell, hum_hz), 0, 1e4, 1},
+        {"noise", NUMBER, AT(plant_load_cell, noise), 0, 1e6, 1},
+        {"bed", BED, AT(plant_load_cell, place.bed), 0, 0, 1},
+        {"x", AXIS, AT(plant_load_cell, place.x_axis), 0, 0, 1},
+        {"y", AXIS, AT(plant_load_cell, place.y_axis), 0, 0, 1},
+        {"z", AXIS, AT(plant_load_cell, place.axis), 0, 0, 1},
+        {"slope_x", AXIS, AT(plant_load_cell, place.slope_x_axis), 0, 0, 1},
+        {"slope_y", AXIS, AT(plant_load_cell, place.slope_y_axis), 0, 0, 1},
+    };
+    struct plant *plant = reader->plant;
+    if (plant->load_cell_count == PLANT_LOAD_CELLS)
+        return plant_text_fail(reader, "load_cell", "too many");
+    struct plant_load_cell *cell = &plant->load_cells[plant->load_cell_count++];
+    cell->place.bed = cell->place.x_axis = cell->place.y_axis = cell->place.axis = -1;
+    cell->place.slope_x_axis = cell->place.slope_y_axis = cell->place.delta = -1;
+    cell->counts_per_gram = 100;
+    cell->stiffness = 4000;
+    cell->hum_hz = 50;
+    return plant_text_fields(reader, FIELDS(fields), rest, cell);
+}
+
 static int read_tmc(const struct plant_reader *reader, char *rest) {
     static const struct plant_field fields[] = {
         {"name", NAME, AT(plant_tmc, name), 0, 0, 0},
@@ -443,12 +475,25 @@ static int read_line(const struct plant_reader *reader, char *line) {
         const char *kind;
         int (*read)(const struct plant_reader *reader, char *rest);
     } kinds[] = {
-        {"plant", read_plant},   {"stepper", read_stepper}, {"axis", read_axis},
-        {"term", read_term},     {"switch", read_switch},   {"body", read_body},
-        {"fan", read_fan},       {"couple", read_couple},   {"cooling", read_cooling},
-        {"heater", read_heater}, {"sensor", read_sensor},   {"point", read_point},
-        {"tmc", read_tmc},       {"diag", read_diag},       {"bed", read_bed},
-        {"probe", read_probe},   {"coil", read_coil},       {"delta", read_delta},
+        {"plant", read_plant},
+        {"stepper", read_stepper},
+        {"axis", read_axis},
+        {"term", read_term},
+        {"switch", read_switch},
+        {"body", read_body},
+        {"fan", read_fan},
+        {"couple", read_couple},
+        {"cooling", read_cooling},
+        {"heater", read_heater},
+        {"sensor", read_sensor},
+        {"point", read_point},
+        {"tmc", read_tmc},
+        {"diag", read_diag},
+        {"bed", read_bed},
+        {"probe", read_probe},
+        {"coil", read_coil},
+        {"delta", read_delta},
+        {"load_cell", read_load_cell},
     };
     line += strspn(line, " \t\r");
     if (!*line || *line == '#')

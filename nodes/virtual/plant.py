@@ -184,6 +184,40 @@ class Coil:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LoadCell:
+    """A load cell that carries the nozzle, with its HX711 or HX717 at two pins.
+
+    A reading is zero + counts_per_gram·F, where the force F, in g, is stiffness times how deep the nozzle is
+    pressed into BED, plus drift·t, plus hum·sin(2·π·hum_hz·t). X, Y, Z and the slopes are axes as of a probe.
+    """
+
+    name: str
+    dout_pin: str
+    sclk_pin: str
+    bed: str | None = None
+    """None: nothing presses against it."""
+    x: str | None = None
+    y: str | None = None
+    z: str | None = None
+    slope_x: str | None = None
+    slope_y: str | None = None
+    rate: float = 80.0
+    """Conversions per second, as it truly is."""
+    counts_per_gram: float = 100.0
+    zero: float = 0.0
+    """Counts without any force."""
+    stiffness: float = 4000.0
+    """g/mm."""
+    drift: float = 0.0
+    """g/s."""
+    hum: float = 0.0
+    """g."""
+    hum_hz: float = 50.0
+    noise: float = 0.0
+    """Counts, standard deviation of a reading."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Tmc:
     """The driver CHIP (tmc2208, tmc2209) of a stepper of the same node, on a UART.
 
@@ -334,6 +368,8 @@ _FIELD_NAMES: Final = {
     "tach_pin": "tach",
     "control_pin": "control",
     "intb_pin": "intb",
+    "dout_pin": "dout",
+    "sclk_pin": "sclk",
     "tx_pin": "tx",
     "rx_pin": "rx",
 }
@@ -354,6 +390,7 @@ class NodePlant:
     deltas: tuple[Delta, ...] = ()
     probes: tuple[Probe, ...] = ()
     coils: tuple[Coil, ...] = ()
+    load_cells: tuple[LoadCell, ...] = ()
     tmcs: tuple[Tmc, ...] = ()
     diags: tuple[Diag, ...] = ()
     bodies: tuple[Body, ...] = ()
@@ -395,6 +432,7 @@ class NodePlant:
             *(("probe", self.probes), ("tmc", self.tmcs)),
             *(("diag", self.diags), ("body", self.bodies), ("couple", self.couples), ("fan", self.fans)),
             *(("cooling", self.coolings), ("heater", self.heaters), ("coil", self.coils)),
+            ("load_cell", self.load_cells),
         ):
             yield from self._parts(kind, parts)
         for sensor in self.sensors:

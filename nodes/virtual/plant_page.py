@@ -49,6 +49,8 @@ class PlantItemKind(IntEnum):
     """A stepper's driver."""
     COIL = 7
     """The coil of an eddy current probe, with its chip."""
+    LOAD_CELL = 8
+    """A load cell that carries the nozzle, with its chip."""
 
 
 class PlantFault(IntEnum):
@@ -96,6 +98,7 @@ _FAULTS: Final[Mapping[PlantItemKind, tuple[PlantFault, ...]]] = {
         PlantFault.OVERHEATED,
     ),
     PlantItemKind.COIL: (PlantFault.OPEN, PlantFault.DEAD, PlantFault.SHORTED),
+    PlantItemKind.LOAD_CELL: (PlantFault.OPEN, PlantFault.DEAD, PlantFault.SHORTED, PlantFault.NEVER),
 }
 
 
@@ -118,7 +121,8 @@ class Item:
     fault: PlantFault
     value: float
     """Body: °C; heater, fan: duty, 0 to 1; sensor: its own °C; switch: 1: pressed; driver: true time (ns)
-    until which its DIAG is high if no step follows; coil: Hz of its last reading."""
+    until which its DIAG is high if no step follows; coil: Hz of its last reading; load cell: g of its
+    last reading."""
     extra: float
     """Heater: J delivered so far; fan: revolutions; sensor: last sample; switch: number of changes; driver:
     SG_RESULT."""
