@@ -1,6 +1,6 @@
 """An endstop on a node: an input that is sampled while an axis moves towards it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -75,6 +75,11 @@ class Endstop(Device):
 class HomingSensor(Protocol):
     """A sensor that may stand in for an endstop."""
 
+    @property
+    def errors(self) -> Sequence[str]:
+        """Why it ends a homing move, by the number that its node tells; sentences without a full stop."""
+        ...
+
     def begin_homing(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
         """Trigger the stop group when it sees its threshold, from CLOCK on."""
 
@@ -95,6 +100,10 @@ class SensorEndstop(Device):
 
     def configure(self, config: NodeConfig) -> None:
         """Add nothing: the sensor is a device of its module."""
+
+    def error(self, number: int) -> str:
+        """Return why it ended a homing move, by the NUMBER that its node told."""
+        return self._sensor.errors[number]
 
     @property
     def _sensor(self) -> HomingSensor:

@@ -6,18 +6,15 @@ at the first reading above a threshold. Registers and their bits are those of th
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
-from nodes.devices.device import Device
+from nodes.devices.bulk_sensor import BulkSensor, SensorError
 from nodes.devices.endstop import EndstopState
 from nodes.devices.trsync import TriggerReason
-from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.node import Node
-from nodes.support.errors import CanductorError
 
 COMMANDS: Final = (
     *("config_i2c", "i2c_set_bus", "i2c_transfer", "config_ldc1612", "query_ldc1612", "query_status_ldc1612"),
@@ -27,12 +24,6 @@ RATE_HZ: Final = 250.0
 """Readings per second."""
 LOOK_S: Final = 0.5 / RATE_HZ
 """Between two looks of the node at the chip."""
-READINGS: Final = 12
-"""In a full message."""
-STATUS_S: Final = 0.1
-"""Between two questions for the number of readings, which give their times."""
-PATIENCE_S: Final = 1.0
-"""For readings that are waited for."""
 TRIES: Final = 3
 """Of a transfer whose answer was of another one."""
 AUTO_S: Final = 0.1
@@ -59,10 +50,6 @@ _MUX_VALUE: Final = 0x020F
 _SETTLE_COUNT: Final = 0x0400
 
 
-class SensorError(CanductorError):
-    """The sensor does not measure; the sentence says why, without a full stop."""
-
-
 @dataclass(frozen=True, slots=True)
 class Reading:
     """One reading."""
@@ -75,12 +62,18 @@ class Reading:
     """What is wrong with it."""
 
 
-class Ldc1612(Device):
+class Ldc1612(BulkSensor[Reading]):
     """The chip of NAME at ADDRESS of I2C BUS (empty: the node's first one), at RATE bit/s.
 
     CLOCK_HZ: of its reference; an internal one is not exact enough. MAX_SENSOR_HZ: what the coil may reach,
     which decides how its frequency is divided. INTB_PIN: wired to INTB; empty: it is not.
     """
+
+    QUERY = "query_ldc1612"
+    STATUS = "query_status_ldc1612"
+    SILENT = ERRORS[3]
+    errors: ClassVar[Sequence[str]] = ERRORS
+    """Why it ends homing, by the number that its node tells."""
 
     def __init__(
         self,
@@ -93,24 +86,15 @@ class Ldc1612(Device):
         max_sensor_hz: float,
         intb_pin: str = "",
     ) -> None:
-        super().__init__(f"the LDC1612 of {name}")
+        super().__init__(f"the LDC1612 of {name}", rate_hz=RATE_HZ)
         self.drive: int | None = None
         """Its drive current, 0 to 31; None: it is not known yet."""
         self.threshold_hz = math.inf
         """Above it homing is triggered."""
-        self.readings: list[Reading] = []
-        """Since they began."""
-        self.counts: list[tuple[int, int]] = []
-        """Clocks (32 bits) of the node, and how many readings there were."""
         self._bus, self._address, self._rate = bus, address, rate
         self._clock_hz, self._intb_pin = clock_hz, intb_pin
         self._divider = max(1, math.ceil(4 * max_sensor_hz / clock_hz))
         self._i2c_oid = 0
-        self._users = 0
-        self._listening = False
-        self._sequence = 0
-        self._came = asyncio.Event()
-        self._rest_ticks = 1
         self._homing_rest_ticks = 0
 
     @property
@@ -148,10 +132,6 @@ class Ldc1612(Device):
         wired = f"_with_intb oid={self.oid} i2c_oid={self._i2c_oid} intb_pin={self._intb_pin}"
         plain = f" oid={self.oid} i2c_oid={self._i2c_oid}"
         config.add_config(what, "config_ldc1612" + (wired if self._intb_pin else plain))
-
-    def started(self, node: Node) -> None:
-        """Listen to NODE, which has become ready."""
-        self._on_report(node, "sensor_bulk_data", self._take)
 
     # ----------------------------------------------------------------------------------------- registers
 
@@ -207,100 +187,23 @@ class Ldc1612(Device):
 
     # ------------------------------------------------------------------------------------------ readings
 
-    @asynccontextmanager
-    async def sampling(self, node: Node) -> AsyncIterator[None]:
-        """Have readings come meanwhile; raises SensorError."""
-        await self.begin(node)
-        try:
-            yield
-        finally:
-            self.end(node)
-
-    @property
-    def is_sampling(self) -> bool:
-        """Whether readings come."""
-        return self._users > 0
-
-    async def begin(self, node: Node) -> None:
-        """Have readings come until ``end``, which is called as often as this; raises SensorError."""
-        self._users += 1
-        try:
-            if self._users == 1:
-                await self._start(node)
-        except BaseException:
-            self.end(node)
-            raise
-
-    def end(self, node: Node) -> None:
-        """Have no more readings come, unless somebody else needs them."""
-        self._users -= 1
-        if not self._users and node.talks:
-            node.send("query_ldc1612", oid=self._oid, rest_ticks=0)
-
-    async def _start(self, node: Node) -> None:
+    async def wake(self, node: Node) -> None:
+        """Set it up; raises SensorError."""
         if self.drive is None:
             raise SensorError(
                 "its drive current is not known: hold the head 20 mm above the bed and send"
                 " LDC_CALIBRATE_DRIVE_CURRENT"
             )
         await self.set_up(node, drive=self.drive)
-        self._listening = False
-        node.send("query_ldc1612", oid=self._oid, rest_ticks=self._rest_ticks)
-        # What comes from now on is no message that was on its way before.
-        self._sequence, self.readings, self.counts = 0, [], []
-        await self.count(node)
-        self._listening = True
 
-    def _take(self, message: Message) -> None:
-        """Take a message of readings; others may have been lost before it."""
-        if not self._listening:
-            return  # of an earlier round
-        data = message.data("data")
-        self._sequence = self._whole(message.integer("sequence"))
-        for at in range(0, len(data) - 3, 4):
-            number = self._sequence * READINGS + at // 4
-            self.readings.append(self._reading(number, int.from_bytes(data[at : at + 4], "big")))
-        self._came.set()
-
-    def _whole(self, sequence: int) -> int:
-        """Return which number SEQUENCE (16 bits) stands for: the nearest one to the last."""
-        return self._sequence + (sequence - self._sequence + (1 << 15)) % (1 << 16) - (1 << 15)
-
-    def _reading(self, number: int, value: int) -> Reading:
+    def reading(self, number: int, content: bytes) -> Reading:
+        """Return the reading of that NUMBER."""
+        value = int.from_bytes(content, "big")
         if value >= LOST:
             return Reading(number, 0.0, ERRORS[min(value - LOST, len(ERRORS) - 1)])
         if value >> 28:
             return Reading(number, 0.0, ERRORS[0])
         return Reading(number, value * self.hz_per_count)
-
-    async def count(self, node: Node) -> int:
-        """Return how many readings there were by now; raises SensorError when some were lost."""
-        answer = await node.query("query_status_ldc1612", "sensor_bulk_status", oid=self._oid)
-        if answer.integer("possible_overflows"):
-            raise SensorError(
-                "readings were lost, as the node could not send them: check the bus for errors and load"
-            )
-        count = self._whole(answer.integer("next_sequence")) * READINGS + answer.integer("buffered") // 4
-        self.counts.append((answer.integer("clock"), count))
-        return count
-
-    async def next_readings(self, node: Node, size: int) -> list[Reading]:
-        """Return SIZE readings that begin from now on; raises SensorError for a bad one or none.
-
-        Messages may get lost on the way, so they need not follow each other.
-        """
-        first = await self.count(node) + 1  # the one that is being made may have begun before
-        try:
-            async with asyncio.timeout(PATIENCE_S + size / RATE_HZ):
-                while len(found := [one for one in self.readings if one.number >= first]) < size:
-                    self._came.clear()
-                    await self._came.wait()
-        except TimeoutError:
-            node_failure = node.failure
-            if node_failure is not None:
-                raise node_failure.with_traceback(None) from None
-            raise SensorError(ERRORS[3]) from None
-        return checked(found[:size])
 
     # -------------------------------------------------------------------------------------------- homing
 
@@ -314,7 +217,7 @@ class Ldc1612(Device):
             threshold=round(self.threshold_hz / self.hz_per_count),
             trsync_oid=trsync_oid,
             trigger_reason=int(TriggerReason.ENDSTOP),
-            error_reason=int(TriggerReason.SENSOR_BAD),
+            error_reason=int(TriggerReason.SENSOR_ERROR_0),
         )
 
     def end_homing(self, node: Node) -> None:
@@ -334,11 +237,3 @@ class Ldc1612(Device):
         return EndstopState(
             bool(answer.integer("homing")), next_clock, reading.frequency_hz > self.threshold_hz
         )
-
-
-def checked(readings: list[Reading]) -> list[Reading]:
-    """Return READINGS; raises SensorError where one is bad."""
-    bad = next((reading.error for reading in readings if reading.error), "")
-    if bad:
-        raise SensorError(bad)
-    return readings

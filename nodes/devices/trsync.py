@@ -26,19 +26,16 @@ class TriggerReason(IntEnum):
     """The host relayed another node's trigger, or ended the homing move."""
     TIMEOUT = 3
     """The timeout was not renewed: host and node had lost contact."""
-    SENSOR_BAD = 4
-    """A sensor that homing looks at flags its readings as bad."""
-    SENSOR_BUS_STATUS = 5
-    """The sensor did not answer on its bus."""
-    SENSOR_BUS_DATA = 6
-    """The sensor did not answer on its bus, with its reading."""
-    SENSOR_SILENT = 7
-    """The sensor made no readings."""
+    SENSOR_ERROR_0 = 4
+    """A sensor that homing looks at cannot be relied upon: its error number 0, and so on."""
+    SENSOR_ERROR_1 = 5
+    SENSOR_ERROR_2 = 6
+    SENSOR_ERROR_3 = 7
 
     @property
     def sensor_error(self) -> int | None:
         """Return the number of a sensor's error; None: it is none."""
-        return self - self.SENSOR_BAD if self >= self.SENSOR_BAD else None
+        return self - self.SENSOR_ERROR_0 if self >= self.SENSOR_ERROR_0 else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,11 +42,12 @@ from coordinator.modules.probes.probe import (
     lift,
 )
 from coordinator.modules.probes.probe_commands import ProbeCommands
+from coordinator.modules.probes.reading_times import Numbers, ReadingTimes
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.probing import place_by_steps
+from nodes.devices.bulk_sensor import SensorError, checked
 from nodes.devices.endstop import EndstopState, SensorEndstop
-from nodes.devices.ldc1612 import STATUS_S, Ldc1612, SensorError, checked
-from nodes.devices.ldc1612 import Reading as CoilReading
+from nodes.devices.ldc1612 import Ldc1612
 from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
@@ -228,6 +229,11 @@ class EddyProbe(Probe):
         )
 
     # ------------------------------------------------------------------------------------- as an endstop
+
+    @property
+    def errors(self) -> Sequence[str]:
+        """Why its node ends a way down."""
+        return self.sensor.errors
 
     def begin_homing(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
         """Trigger the stop group when the coil is at descend_z."""
@@ -448,50 +454,39 @@ class EddyProbe(Probe):
         return Done((f"{self.name}: {found}; SAVE_CONFIG writes it",))
 
 
-Numbers = np.ndarray[Any, np.dtype[np.float64]]
-
-
 class _Flight:
-    """The readings of a scan in flight by PROBE, and when each was made."""
+    """The readings of a scan in flight by PROBE."""
 
     def __init__(self, probe: EddyProbe) -> None:
         self._probe = probe
-        self._asking: asyncio.Task[None] | None = None
-        self._counted: list[tuple[float, int]] = []
-        """Print times, s, and how many readings there were."""
-        self.began = False
+        self._times: ReadingTimes | None = None
+
+    @property
+    def began(self) -> bool:
+        """Whether there are readings."""
+        return self._times is not None
 
     async def begin(self) -> None:
         """Begin to read; raises CanductorError."""
-        self._probe.calibrated()
-        with self._probe.explained():
-            await self._probe.sensor.begin(self._probe.node)
-        self.began = True
-        self._asking = asyncio.create_task(self._ask())
-
-    async def _ask(self) -> None:
-        with contextlib.suppress(CanductorError):
-            while True:
-                await self._count()
-                await asyncio.sleep(STATUS_S)
-
-    async def _count(self) -> None:
-        """Note how many readings there are, and when: the node's clock of 32 bits is soon ambiguous."""
-        count = await self._probe.sensor.count(self._probe.node)
-        clock, _ = self._probe.sensor.counts[-1]
-        self._counted.append((self._probe.live.print_time_of(self._probe.node_name, clock), count))
+        probe = self._probe
+        probe.calibrated()
+        times = ReadingTimes(probe.live, probe.node_name, probe.sensor)
+        with probe.explained():
+            await probe.sensor.begin(probe.node)
+        self._times = times
+        times.begin()
 
     async def heights(self, passed: Sequence[float]) -> list[float]:
         """End it; return the heights at the print times PASSED, mm; raises CanductorError."""
-        probe = self._probe
-        sensor = probe.sensor
+        probe, times = self._probe, self._times
+        assert times is not None
         try:
             with probe.explained():
-                await self._count()
-                await sensor.next_readings(probe.node, READINGS)
-                await self._count()
-                readings = checked(list(sensor.readings))
-                at_s = self._times(readings)
+                await times.count()
+                await probe.sensor.next_readings(probe.node, READINGS)
+                await times.count()
+                readings = checked(list(probe.sensor.readings))
+                at_s = times.middles(readings)
                 table = probe.calibrated()
                 heights = [table.height(reading.frequency_hz) for reading in readings]
                 found = [height_at(time_s - at_s, heights) for time_s in passed]
@@ -501,18 +496,8 @@ class _Flight:
 
     def end(self) -> None:
         """End the readings, unless they have ended; on the control loop."""
-        asking, self._asking = self._asking, None
-        if asking is not None:
-            asking.cancel()
+        if self._times is not None and self._times.end():
             self._probe.sensor.end(self._probe.node)
-
-    def _times(self, readings: Sequence[CoilReading]) -> Numbers:
-        """Return the print times of the middles of the conversions."""
-        clocks_s, counts = np.array(self._counted).T
-        period_s, begin_s = np.polyfit(counts, clocks_s, 1)
-        # When COUNT readings are there, the last of them ended half a conversion before, on average.
-        numbers = np.array([reading.number for reading in readings], dtype=np.float64)
-        return np.asarray(begin_s + period_s * numbers, dtype=np.float64)
 
 
 def height_at(after_s: Numbers, heights: Sequence[float]) -> float:

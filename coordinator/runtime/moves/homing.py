@@ -22,7 +22,6 @@ from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.single import START_LEAD_S, WAY, Ramp, SingleMove, ratio_of
 from nodes.clock.clock import Ticks, extend32
 from nodes.devices.endstop import Endstop, SensorEndstop
-from nodes.devices.ldc1612 import ERRORS as SENSOR_ERRORS
 from nodes.devices.trsync import NO_GROUP, TriggerReason, Trsync, TrsyncState
 from nodes.node.node import Node
 from nodes.support.errors import CanductorError
@@ -361,8 +360,8 @@ class HomingMove:
                     " itself; check the bus for errors and load",
                 )
         error = states[leg.endstop_node.name].reason.sensor_error
-        if error is not None:
-            raise MoveEndedError(leg.name, SENSOR_ERRORS[error])
+        if error is not None and isinstance(leg.endstop, SensorEndstop):
+            raise MoveEndedError(leg.name, leg.endstop.error(error))
         if not _switched(leg, states):
             raise EndstopNotFoundError(
                 f"axis {leg.name} moved {self._ramp.way_mm:g} mm and its endstop did not switch; "
