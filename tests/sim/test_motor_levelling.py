@@ -14,6 +14,7 @@ import pytest
 from coordinator.config.errors import ConfigError
 from coordinator.virtual_machine.plant_bed import BedSettings
 from nodes.virtual.plant import Bed
+from nodes.virtual.plant_page import PlantFault
 from tests.stages.printer_text import section
 from tests.stages.probe_stage import OFFSET, ProbeStage, bed_height, heights, machine_text
 from tests.stages.served import Served, running
@@ -229,6 +230,16 @@ def test_the_motors_are_found(tmp_path: Path, delta: str) -> None:
     assert numbers(unsaved(stage)["z_positions"]) == pytest.approx(np.array(list(THREE.values())), abs=2.5)
     assert passes(output) <= 3
     assert gap_over_bed(stage) < 0.01
+
+
+def test_a_motor_that_stays_raised_is_told(tmp_path: Path) -> None:
+    """The probe fails while the second motor is raised."""
+    stage = make(tmp_path, "z_tilt_ng", {}, z_positions=None, autodetect_delta=2)
+    name = list(THREE)[1]
+    stage.on_echo[f"{name} is raised by 2 mm"] = lambda: stage.fault(PlantFault.NEVER)
+    said = failure(stage, "G28", "G1 Z9 F600", "Z_TILT_AUTODETECT")
+    assert "did not trigger" in said
+    assert said.endswith(f"; {name} is raised by 2 mm and stays so: level before you print")
 
 
 def test_it_says_what_it_needs(tmp_path: Path) -> None:

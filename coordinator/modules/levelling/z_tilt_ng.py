@@ -6,14 +6,15 @@ the other by DELTA. The bed then tilts by as much as 1 at that motor and 0 at th
 these planes have those heights, there the motors are.
 """
 
-from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, TypeVar
 
 import numpy as np
 
 from coordinator.config.options import BadValue, FloatOption, IntOption, Option, SectionSpec
 from coordinator.gcode.commands import AtStandstill, Call, Immediate, Phases, ProgramContext, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.parameters import bounded
 from coordinator.gcode.parser import Command, WordError
 from coordinator.kinematics.base import Point
@@ -23,6 +24,10 @@ from coordinator.modules.levelling.points import PlacesOption, how_to_measure
 from coordinator.modules.levelling.surfaces import Place, Plane, fit_plane
 from coordinator.modules.levelling.z_tilt import POINTS, POSITIONS, check_places
 from coordinator.modules.probes.probe import Measuring, Probe
+from coordinator.runtime.machine import MachineStopped
+from nodes.support.errors import CanductorError
+
+T = TypeVar("T")
 
 LARGEST_MM: Final = 10.0
 """Of an offset, and of a tilt."""
@@ -159,9 +164,11 @@ class ZTiltNg(MotorLevelling):
             level, tilted = fit_plane(found), []
             for number, motor in enumerate(self.motors):
                 by = [delta if number == other else 0.0 for other in range(MOTORS)]
-                yield Immediate((f"{motor.name} is raised by {delta:g} mm",))
+                raised = f"{motor.name} is raised by {delta:g} mm"
+                yield Immediate((raised,))
                 yield self._raise(job, runs, by)
-                measured = yield from self._measure_often(job, runs, self._places)
+                measuring = self._measure_often(job, runs, self._places)
+                measured = yield from noted(measuring, f"{raised} and stays so: level before you print")
                 yield self._raise(job, runs, [-one for one in by])
                 if measured is None:
                     return
@@ -235,6 +242,31 @@ class ZTiltNg(MotorLevelling):
     def _save(self, option: str, text: str) -> None:
         if (live := self._live) is not None:
             live.soon_on_loop(lambda: live.save(self.name, option, text))
+
+
+def noted(phases: Generator[Reading, None, T], note: str) -> Generator[Reading, None, T]:
+    """Go through PHASES, of which an error at standstill ends with NOTE."""
+
+    def with_note(act: Callable[[], Awaitable[Done | None]]) -> Callable[[], Awaitable[Done | None]]:
+        async def noting() -> Done | None:
+            try:
+                return await act()
+            except MachineStopped:
+                raise
+            except CanductorError as error:
+                raise CanductorError(f"{error}; {note}") from error
+
+        return noting
+
+    while True:
+        try:
+            phase = next(phases)
+        except StopIteration as end:
+            found: T = end.value
+            return found
+        if isinstance(phase, AtStandstill):
+            phase = replace(phase, perform=with_note(phase.perform))
+        yield phase
 
 
 def find_motors(level: Plane, tilted: Sequence[Plane], delta: float) -> list[Place] | None:
