@@ -13,11 +13,11 @@ import numpy as np
 from coordinator.config.model import SECOND_CARRIAGE, MachineDescription, RailDescription, StepperDescription
 from coordinator.kinematics.base import Point
 from coordinator.kinematics.delta import Delta
-from coordinator.virtual_machine.plant_bed import BedSettings, ProbeParts, probe_parts
+from coordinator.virtual_machine.plant_bed import BedSettings, ProbeParts, load_cells, probe_parts
 from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
 from coordinator.virtual_machine.plant_tmc import machine_drivers
 from nodes.support.errors import CanductorError
-from nodes.virtual.plant import Axis, Coil, NodePlant, Stepper, Switch, Term
+from nodes.virtual.plant import Axis, Coil, LoadCell, NodePlant, Stepper, Switch, Term
 
 AXES: Final = "xyz"
 START_MM: Final = 30.0
@@ -71,6 +71,7 @@ def machine_plants(
     plants = [_mechanics(description, node.name, endstops, settings) for node in description.nodes]
     if probe is not None:
         plants = [_with_probe(plant, probe) for plant in plants]
+    scales = load_cells(description, settings.bed)
     heat = machine_heat(description, settings.heat)
     drivers = machine_drivers(description)
     return {
@@ -80,6 +81,7 @@ def machine_plants(
             ambient=settings.heat.ambient_c,
             tmcs=tuple(drivers[plant.node].tmcs),
             diags=tuple(drivers[plant.node].diags),
+            load_cells=(*plant.load_cells, *scales.get(plant.node, ())),
             **heat[plant.node].parts(),
         )
         for number, plant in enumerate(plants)
@@ -167,6 +169,8 @@ def _with_probe(plant: NodePlant, parts: ProbeParts) -> NodePlant:
     axes = (*plant.axes, *parts.axes)
     if isinstance(parts.probe, Coil):
         return replace(plant, axes=axes, beds=(parts.bed,), coils=(parts.probe,))
+    if isinstance(parts.probe, LoadCell):
+        return replace(plant, axes=axes, beds=(parts.bed,), load_cells=(parts.probe,))
     return replace(plant, axes=axes, beds=(parts.bed,), probes=(parts.probe,), deltas=parts.deltas)
 
 

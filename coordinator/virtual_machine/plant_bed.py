@@ -6,18 +6,40 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.config.file import parse_config
+from coordinator.config.file import RawSection, parse_config
 from coordinator.config.model import MachineDescription
 from coordinator.config.pins import PinOption
 from coordinator.config.sections.nodes import make_pin_registry
+from coordinator.config.sections.probe import DOUT, LOAD_CELL
 from coordinator.kinematics.delta import Delta
+from nodes.devices.hx71x import CHIPS
 from nodes.support.errors import CanductorError
 from nodes.virtual import plant
-from nodes.virtual.plant import Axis, Bed, Coil, Probe, Term
+from nodes.virtual.plant import Axis, Bed, Coil, LoadCell, Probe, Term
 
 _BUSES: Final = ("i2c1", "i2c2")
 """Of a virtual node."""
 _CONTROL: Final = PinOption(name="control_pin", help="", share="plant")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadCellSettings:
+    """The load cell that carries the nozzle, as it truly is."""
+
+    counts_per_gram: float = 100.0
+    zero: float = 20_000.0
+    """Counts without any force."""
+    stiffness: float = 4000.0
+    """g/mm."""
+    drift: float = 0.0
+    """g/s."""
+    hum: float = 0.0
+    """g, at hum_hz."""
+    hum_hz: float = 50.0
+    noise: float = 0.0
+    """Counts, standard deviation of a reading."""
+    rate: float = 1.0
+    """Conversions per second, as a share of sample_rate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +59,7 @@ class BedSettings:
     """How much the frequency of its coil grows per K, as a share."""
     coil_clock: float = 1.0
     """How fast the reference clock of its chip truly is, as a share of the configured frequency."""
+    load_cell: LoadCellSettings = field(default_factory=LoadCellSettings)
     lean_x: float = 0.0
     """How much higher it triggers per mm along X, where the axis is twisted; from x0 of the bed on."""
     lean_y: float = 0.0
@@ -56,7 +79,7 @@ class ProbeParts:
     node: str
     axes: tuple[Axis, ...]
     bed: Bed
-    probe: Probe | Coil
+    probe: Probe | Coil | LoadCell
     deltas: tuple[plant.Delta, ...] = ()
 
 
@@ -74,6 +97,9 @@ def probe_parts(description: MachineDescription, axes: Sequence[Axis], settings:
     elif settings.supports:
         z, *tilts_ = frame_axes(description, z, settings)
         tilts = tuple(tilts_)
+    if described.section == LOAD_CELL:
+        cell = _load_cell(description, settings, (x, y, z, *tilts))
+        return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, cell)
     if pin.sensor:
         coil = _coil(description, settings, (x, y, z, *tilts))
         return ProbeParts(pin.node, (x, y, z, *tilts), settings.shape, coil)
@@ -143,11 +169,60 @@ def _coil(description: MachineDescription, settings: BedSettings, axes: Sequence
         slope_y=slopes[1].name if slopes else None,
         offset_x=described.offset[0],
         offset_y=described.offset[1],
-        intb_pin=given["intb_pin"].rpartition(":")[2].strip("!^~ ") if "intb_pin" in given else None,
+        intb_pin=_bare(given["intb_pin"]) if "intb_pin" in given else None,
         clock=float(given.get("frequency", "12e6")) * settings.coil_clock,
         drift=settings.coil_drift,
         noise=settings.coil_noise_hz,
     )
+
+
+def _load_cell(description: MachineDescription, settings: BedSettings, axes: Sequence[Axis]) -> LoadCell:
+    """Return the load cell of a probe that is the nozzle; X, Y, Z and perhaps slopes are AXES."""
+    assert description.probe is not None
+    x, y, z, *slopes = axes
+    return replace(
+        _cell("probe", parse_config(description.path).sections[description.probe.section], settings),
+        bed=settings.shape.name,
+        x=x.name,
+        y=y.name,
+        z=z.name,
+        slope_x=slopes[0].name if slopes else None,
+        slope_y=slopes[1].name if slopes else None,
+    )
+
+
+def load_cells(description: MachineDescription, settings: BedSettings) -> dict[str, tuple[LoadCell, ...]]:
+    """Return the scales of [load_cell] sections by node; nothing is on them but drift and hum."""
+    found: dict[str, tuple[LoadCell, ...]] = {}
+    for name, section in parse_config(description.path).sections.items():
+        if section.kind == "load_cell":
+            node = DOUT.parse(section.options[DOUT.name].value).node
+            found[node] = (*found.get(node, ()), _cell(name.replace(" ", "_"), section, settings))
+    return found
+
+
+def _cell(name: str, section: RawSection, settings: BedSettings) -> LoadCell:
+    """Return the load cell of SECTION, without what presses against it."""
+    given = {name: option.value for name, option in section.options.items()}
+    cell = settings.load_cell
+    return LoadCell(
+        name=name,
+        dout_pin=_bare(given["dout_pin"]),
+        sclk_pin=_bare(given["sclk_pin"]),
+        rate=float(given.get("sample_rate", CHIPS[given["sensor_type"]].rates[0])) * cell.rate,
+        counts_per_gram=cell.counts_per_gram,
+        zero=cell.zero,
+        stiffness=cell.stiffness,
+        drift=cell.drift,
+        hum=cell.hum,
+        hum_hz=cell.hum_hz,
+        noise=cell.noise,
+    )
+
+
+def _bare(pin: str) -> str:
+    """Return the name of a PIN on its node."""
+    return pin.rpartition(":")[2].strip("!^~ ")
 
 
 def _control_pin(description: MachineDescription, section: str, node: str) -> str | None:

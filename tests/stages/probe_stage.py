@@ -40,6 +40,14 @@ KINDS: Mapping[str, Mapping[str, object]] = {
         "i2c_mcu": "toolhead",
         "reg_drive_current": 15,
     },
+    "load_cell_probe": {
+        **dict.fromkeys(("pin", "x_offset", "y_offset", "z_offset")),
+        "sensor_type": "hx711",
+        "dout_pin": "toolhead:PC5",
+        "sclk_pin": "toolhead:PC6",
+        "counts_per_gram": 100,
+        "reference_tare_counts": 20000,
+    },
     "bltouch": {"pin": None, "sensor_pin": "^toolhead:PC5", "control_pin": "toolhead:PB0"},
 }
 """What other kinds of probes have in their sections."""

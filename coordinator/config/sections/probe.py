@@ -44,7 +44,7 @@ Z_OFFSET: Final = FloatOption(
     maximum=MAX_POSITION,
 )
 EDDY: Final = "probe_eddy_current"
-"""First word of the sections of probes that are a sensor on an I2C bus, not a switch."""
+"""First word of the sections of probes that are a coil on an I2C bus."""
 I2C_MCU: Final = TextOption(name="i2c_mcu", help="node of the I2C bus", default=PRIMARY_NODE)
 DESCEND_Z: Final = FloatOption(
     name="descend_z",
@@ -54,6 +54,10 @@ DESCEND_Z: Final = FloatOption(
     above=0,
     maximum=10,
 )
+LOAD_CELL: Final = "load_cell_probe"
+DOUT: Final = PinOption(name="dout_pin", help="input from the chip's data output")
+SENSORS: Final = (EDDY, LOAD_CELL)
+"""First words of the sections of probes that are no switch."""
 _SENSOR: Final = PinOption(name=I2C_MCU.name, help="", share="endstop")
 T = TypeVar("T")
 
@@ -64,7 +68,7 @@ def note_probe(config: ConfigFile, pins: PinRegistry) -> None:
     Raises ConfigError where there are two.
     """
     section = _section(config)
-    if section is not None and section.kind == EDDY:
+    if section is not None and section.kind in SENSORS:
         _note_sensor(section, pins)
         return
     pin = None if section is None else _value(section, INPUTS[section.name])
@@ -74,16 +78,23 @@ def note_probe(config: ConfigFile, pins: PinRegistry) -> None:
 
 
 def _note_sensor(section: RawSection, pins: PinRegistry) -> None:
-    node = _value(section, I2C_MCU) or PRIMARY_NODE
     x, y = (_value(section, option) or 0.0 for option in OFFSETS)
-    z = _value(section, DESCEND_Z) or _value(section, Z_OFFSET) or DESCEND_Z.default
-    assert z is not None
+    if section.kind == LOAD_CELL:
+        dout = _value(section, DOUT)
+        if dout is None:
+            return  # a chip on SPI, which is not supported yet
+        node, z = dout.node, _value(section, Z_OFFSET) or 0.0
+    else:
+        node = _value(section, I2C_MCU) or PRIMARY_NODE
+        z = _value(section, DESCEND_Z) or _value(section, Z_OFFSET) or DESCEND_Z.default or 0.0
     pin = PinName(node if node in pins.nodes else PRIMARY_NODE, section.name, sensor=section.name)
     pins.probe = ProbeSwitch(pin, (x, y, z), section.name)
 
 
 def _section(config: ConfigFile) -> RawSection | None:
-    found = [section for name, section in config.sections.items() if name in INPUTS or section.kind == EDDY]
+    found = [
+        section for name, section in config.sections.items() if name in INPUTS or section.kind in SENSORS
+    ]
     if len(found) > 1:
         raise ConfigError(
             found[1].place,

@@ -54,7 +54,7 @@ class BedScrews(Module):
         self._round: str = ""
         """``adjust``, then ``fine``; empty: nothing is going on."""
         self._at = self._accepted = 0
-        build.shared(ManualProbe).other = self
+        build.shared(ManualProbe).others.append(self)
         reads: tuple[tuple[str, str, Callable[[Call], Reading]], ...] = (
             ("BED_SCREWS_ADJUST", "Move to each bed screw in turn, to adjust it by hand", self._read_begin),
             (

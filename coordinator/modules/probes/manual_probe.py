@@ -26,7 +26,7 @@ _BEGUN: Final = "now move with TESTZ Z=-0.1 (+, -, ++, --) until it fits; end wi
 
 
 class TakesAnswers(Protocol):
-    """Another search that ACCEPT and ABORT answer while it is active."""
+    """Another dialogue that ACCEPT and ABORT answer while it is active."""
 
     @property
     def is_active(self) -> bool:
@@ -50,8 +50,8 @@ class ManualProbe(Module):
         """What a height that is accepted leads to; None: nothing is looked for."""
         self._then: Then | None = None
         """What follows a height that is accepted, where others are looked for after it."""
-        self.other: TakesAnswers | None = None
-        """Another search, such as that for the turns of screws."""
+        self.others: list[TakesAnswers] = []
+        """Other dialogues, such as that for the turns of screws."""
         self._speed = SPEED
         self._tried: list[float] = []
         self._z = 0.0
@@ -127,8 +127,17 @@ class ManualProbe(Module):
         """Raise WordError where no height can be looked for."""
         if "Z" not in call.homed:
             raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
-        if self._accepted is not None or (self.other is not None and self.other.is_active):
+        self.check_no_dialogue(call)
+
+    def check_no_dialogue(self, call: Call) -> None:
+        """Raise WordError where ACCEPT and ABORT have a meaning already."""
+        if self._accepted is not None or self._other is not None:
             raise WordError(f"{call.command.name}: a height is looked for already; ACCEPT or ABORT that")
+
+    @property
+    def _other(self) -> TakesAnswers | None:
+        """The other dialogue that is going on."""
+        return next((other for other in self.others if other.is_active), None)
 
     def begin(
         self, call: Call, accepted: Callable[[float], tuple[str, ...]], speed: float = SPEED
@@ -208,8 +217,8 @@ class ManualProbe(Module):
 
     def _read_accept(self, call: Call) -> Reading:
         call.parameters()
-        if self.other is not None and self.other.is_active:
-            return self.other.read_accept(call)
+        if (other := self._other) is not None:
+            return other.read_accept(call)
         accepted = self._check_active(call)
         if (then := self._then) is not None:
             return Phases(lambda job: self._go_on(job, then))
@@ -227,8 +236,8 @@ class ManualProbe(Module):
 
     def _read_abort(self, call: Call) -> Reading:
         call.parameters()
-        if self.other is not None and self.other.is_active:
-            return self.other.read_abort(call)
+        if (other := self._other) is not None:
+            return other.read_abort(call)
         self._check_active(call)
 
         async def abort() -> Done:

@@ -163,8 +163,7 @@ class Probe(ProbeEndstop):
         super().__init__(build)
         if self.INPUT is not None:
             build.pin(self.INPUT)
-        x, y = (build.get(option) for option in OFFSETS)
-        self.offset: Point = (x, y, self.trigger_height(build))
+        self.offset: Point = (*self.side_offset(build), self.trigger_height(build))
         """From the nozzle: X, Y, and how high that is when the probe triggers, mm."""
         speed = build.get(SPEED)
         self.measuring = Measuring(
@@ -195,6 +194,11 @@ class Probe(ProbeEndstop):
         self._skews: Skews | None = None
         self.last_query = False
         self._last: Measured | None = None
+
+    def side_offset(self, build: Build) -> tuple[float, float]:
+        """Return how far it is from the nozzle along X and Y, mm; raises ConfigError."""
+        x, y = (build.get(option) for option in OFFSETS)
+        return x, y
 
     def trigger_height(self, build: Build) -> float:
         """Return how high the nozzle is when it triggers, mm; raises ConfigError."""

@@ -5,6 +5,7 @@ how far the head went on afterwards does not matter.
 """
 
 import asyncio
+import statistics
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -20,6 +21,7 @@ from coordinator.runtime.moves.homing import (
     HomingMove,
     MoveEndedError,
 )
+from coordinator.runtime.moves.single import Ramp, SingleMove
 from nodes.support.errors import CanductorError
 
 SHORTEST_MM: Final = 1e-3
@@ -131,6 +133,38 @@ class ProbingMove:
         except CanductorError:
             place = None
         return "" if place is None else f"{place[2]:.3f} mm"
+
+
+class SlowLift:
+    """Lifts the head of MACHINE by WAY_MM at SPEED, from rest, whatever it is in contact with."""
+
+    def __init__(self, machine: Machine, way_mm: float, speed: float) -> None:
+        ways = downwards(machine.description)
+        assert ways is not None
+        limits = machine.description.limits
+        self._machine = machine
+        self._ways = {name: -way for name, way in ways.items()}
+        accel = min(limits.max_accel, limits.max_z_accel)
+        self._ramp = Ramp(way_mm, min(speed, limits.max_z_velocity), accel)
+        self.begin_s = self.end_s = 0.0
+        """Print times; ``run`` sets them."""
+
+    async def run(self) -> float:
+        """Move, and return the way that was made by the steps, mm; raises CanductorError."""
+        before = await self._machine.query_stepper_counts()
+        move = SingleMove(self._machine, self._ramp, ways=self._ways)
+        self.begin_s, self.end_s = move.begin_s, move.end_s
+        await move.run()
+        after = await self._machine.query_stepper_counts()
+        return statistics.fmean(
+            (after[motor.name] - before[motor.name]) * motor.step_distance / self._ways[motor.name]
+            for motor in self._machine.description.motors
+            if motor.name in self._ways
+        )
+
+    def way_at(self, print_time: float) -> float:
+        """Return how far up it is at a print time, mm."""
+        return self._ramp.way_at(print_time - self.begin_s)
 
 
 async def place_by_steps(machine: Machine) -> Point | None:
