@@ -12,22 +12,29 @@ import pytest
 from coordinator.virtual_machine.plant_bed import BedSettings
 from nodes.support.errors import CanductorError
 from nodes.virtual.plant import Bed
-from nodes.virtual.plant_page import PlantFault
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.profiles import is_full
 from tests.stages.probe_stage import OFFSET, ProbeStage, bed_height, machine_text
 
-SEEDS = 200 if is_full() else 8
+SEEDS = 200 if is_full() else 9
 LOWEST_MM = -0.5
 """position_min of Z."""
 SPEED = 8.0
 """mm/s of the first approach, the fastest way down."""
 TIMEOUT_S = 0.25
 """A node that hears nothing of the host for so long stops by itself."""
-DEEPEST_MM = max(TIMEOUT_S * SPEED - OFFSET[2], -LOWEST_MM + 0.5) + 0.15
-"""How far below the bed the nozzle may get: what a node goes on without the others, or 0.5 mm below
-position_min; and what the bed is higher elsewhere."""
+BEYOND_MM = 0.15
+"""What the bed is higher elsewhere, and what the head goes on while it brakes."""
 FAULTS = ("none", "never", "always", "cut toolhead", "cut mcu", "stall", "stuck", "late")
-KINDS = ("probe", "bltouch")
+KINDS = ("probe", "bltouch", "load_cell_probe")
+CELL_SPEED = 4.0
+"""The same for a load cell, whose probe is the nozzle itself."""
+CELL_FAULTS = {
+    "never": PlantFault.NEVER,
+    "always": PlantFault.SHORTED,
+    "stuck": PlantFault.DEAD,
+    "late": PlantFault.OPEN,
+}
 SWITCH_FAULTS = {
     "never": PlantFault.NEVER,
     "always": PlantFault.ALWAYS,
@@ -45,6 +52,10 @@ EXPLAINED = (
     r"node toolhead shut down: Timer too close",
     r"the BLTouch did not (lower|raise) its pin: 3 times .*; (Z is -?\d|the head was lowered)",
     r"arming its nodes took too long",
+    r"the sensor (makes no readings|is at its limit): check",
+    r"the force (left its safe range|at rest is -?\d+ g)",
+    r"the force (did not fall|changed by \d+\.\d g all the way)",
+    r"the nozzle left the bed (at once|only at its end)",
 )
 
 
@@ -57,9 +68,14 @@ class Case:
             x0=100, y0=100, tilt_x=chance.uniform(-5e-4, 5e-4), tilt_y=chance.uniform(-5e-4, 5e-4), radius=150
         )
         self.fault = FAULTS[seed % len(FAULTS)]
-        z = {"position_min": LOWEST_MM, "homing_speed": SPEED}
-        kind = KINDS[seed // len(FAULTS) % len(KINDS)] if is_full() else KINDS[seed % 3 // 2]
-        text = machine_text(z=z, kind=kind, speed=chance.uniform(1, 6))
+        kind = KINDS[seed // len(FAULTS) % len(KINDS)] if is_full() else KINDS[seed % len(KINDS)]
+        self.is_cell = kind == "load_cell_probe"
+        fast, above = (CELL_SPEED, 0.0) if self.is_cell else (SPEED, OFFSET[2])
+        self.bound_mm = max(TIMEOUT_S * fast - above, -LOWEST_MM + 0.5) + BEYOND_MM
+        """How far below the bed the nozzle may get: what a node goes on without the others, or 0.5 mm below
+        position_min."""
+        z = {"position_min": LOWEST_MM, "homing_speed": fast}
+        text = machine_text(z=z, kind=kind, speed=chance.uniform(1, 6 if above else CELL_SPEED))
         bed = BedSettings(shape=shape, noise_mm=chance.uniform(0, 0.02), hysteresis_mm=chance.uniform(0, 0.2))
         start = (0.0, 0.0, chance.uniform(4, 14))
         self.stage = ProbeStage(
@@ -74,8 +90,10 @@ class Case:
         self.stage.at(0.0, self._watch)
 
     def _found(self) -> bool:
-        x, y = self._nozzle[:2]
-        return self.stage.true_mm("z") <= self.stage.trigger_z(x, y) + 0.05
+        x, y, z = self._nozzle
+        if self.is_cell:
+            return z <= bed_height(self.stage.bed.shape, x, y) + 0.05
+        return z <= self.stage.trigger_z(x, y) + 0.05
 
     @property
     def _nozzle(self) -> tuple[float, float, float]:
@@ -94,6 +112,9 @@ class Case:
             self.stage.stage.cut(self.fault.split()[1])
         elif self.fault == "stall":
             self.stage.stage.stall(0.6)
+        elif self.fault != "none" and self.is_cell:
+            page = self.stage.page("toolhead")
+            page.set_fault(PlantItemKind.LOAD_CELL, "probe", CELL_FAULTS[self.fault])
         elif self.fault != "none":
             self.stage.fault(SWITCH_FAULTS[self.fault])
 
@@ -113,7 +134,7 @@ class Case:
 def test_no_crash_is_deeper_than_stated_and_every_stop_is_explained(tmp_path: Path, seed: int) -> None:
     case = Case(tmp_path, seed)
     said = case.run()
-    assert case.deepest_mm < DEEPEST_MM, (case.fault, said)
+    assert case.deepest_mm < case.bound_mm, (case.fault, said)
     if case.fault == "none":
         assert not said
     else:
