@@ -56,15 +56,15 @@ def _motion(live: "ModuleContext | None") -> tuple[Sequence[float], float, float
 
 def _node(node: "Node") -> Mapping[str, object]:
     try:
-        dictionary = node.dictionary
-    except CanductorError:  # lost before it was known
+        dictionary, freq_hz = node.dictionary, node.clock_freq_hz
+    except CanductorError:  # lost before it was known, or brought back and not known yet
         return {"mcu_version": "", "mcu_build_versions": "", "mcu_constants": {}, "last_stats": {}}
     load = node.load
     stats = (
-        {"freq": node.clock_freq_hz}
+        {"freq": freq_hz}
         if load is None
         else {
-            "freq": node.clock_freq_hz,
+            "freq": freq_hz,
             "mcu_awake": round(load.awake, 4),
             "mcu_task_avg": load.task_s,
         }
