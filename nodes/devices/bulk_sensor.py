@@ -5,6 +5,8 @@ follows from the numbers that the node tells with its clock.
 """
 
 import asyncio
+import contextlib
+import math
 from abc import abstractmethod
 from collections import deque
 from collections.abc import AsyncIterator
@@ -70,6 +72,9 @@ class BulkSensor(Device, Generic[R]):
         self._listening = False
         self._sequence = 0
         self._came = asyncio.Event()
+        self._restarting: asyncio.Task[None] | None = None
+        self.heard_s = -math.inf
+        """When the last message came, by the control loop's clock."""
 
     @abstractmethod
     async def wake(self, node: Node) -> None:
@@ -82,6 +87,12 @@ class BulkSensor(Device, Generic[R]):
     def started(self, node: Node) -> None:
         """Listen to NODE, which has become ready."""
         self._on_report(node, "sensor_bulk_data", self._take)
+        if self._users:  # it was lost, and begins anew
+            self._restarting = asyncio.create_task(self._restart(node))
+
+    async def _restart(self, node: Node) -> None:
+        with contextlib.suppress(CanductorError):  # whoever waits for readings hears that
+            await self._start(node)
 
     @asynccontextmanager
     async def sampling(self, node: Node) -> AsyncIterator[None]:
@@ -133,6 +144,7 @@ class BulkSensor(Device, Generic[R]):
         for at in range(0, len(data) - READING_BYTES + 1, READING_BYTES):
             number = self._sequence * READINGS + at // READING_BYTES
             self.readings.append(self.reading(number, data[at : at + READING_BYTES]))
+        self.heard_s = asyncio.get_running_loop().time()
         self._came.set()
 
     def _whole(self, sequence: int) -> int:

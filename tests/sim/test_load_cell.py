@@ -354,3 +354,35 @@ def test_the_last_tap_is_shown(tmp_path: Path) -> None:
     assert shown["last_z_result"] == pytest.approx(heights(output)[0], abs=1e-6)
     assert shown["endstop_tare_counts"] == pytest.approx(ZERO, abs=100)
     assert 0 < shown["last_trigger_time"] < 120
+
+
+def test_a_scale_weighs_again_when_its_node_is_back(tmp_path: Path) -> None:
+    wiring = {"sensor_type": "hx711", "counts_per_gram": 100, "reference_tare_counts": ZERO}
+    sections = (
+        section("mcu scale", canbus_uuid="010203040506", canbus_interface="can0", policy="optional")
+        + section("load_cell", dout_pin="scale:PC5", sclk_pin="scale:PC6", **wiring)
+        + STATUS
+    )
+    text = machine_text(kind="probe", pin="^toolhead:PC3", z=SWITCH, sections=sections)
+    stage = ProbeStage(tmp_path, text, bed=BedSettings(load_cell=LoadCellSettings(drift=1)))
+    stage.on_echo["off"] = stage.node("scale").power_off
+    stage.on_echo["on"] = stage.node("scale").power_on
+    output = stage.do(
+        *("G4 S9", "M400", "SEE OF=load_cell", "M118 off", "G4 S5", "M400", "SEE OF=load_cell"),
+        *("M118 on", "G4 S9", "M400", "SEE OF=load_cell", "LOAD_CELL_READ"),
+    )
+    found = [ast.literal_eval(text[6:])["force_g"] for text in output if text.startswith("echo: {")]
+    assert found[0] > 5
+    assert found[1] is None, "what was long ago is no force of now"
+    assert found[2] > found[0] + 10
+    assert output[-1].startswith("load_cell: ")
+
+
+def test_a_force_that_is_not_measured_any_more_is_not_shown(tmp_path: Path) -> None:
+    stage = stage_with(tmp_path, z=SWITCH, sections=STATUS)
+    stage.on_echo["dead"] = lambda: fault(stage, PlantFault.DEAD)
+    output = stage.do(
+        *("G4 S2", "M400", "SEE OF=load_cell_probe", "M118 dead", "G4 S4", "M400"), "SEE OF=load_cell_probe"
+    )
+    found = [ast.literal_eval(text[6:])["force_g"] for text in output if text.startswith("echo: {")]
+    assert found == [pytest.approx(0, abs=1), None]

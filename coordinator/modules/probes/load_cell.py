@@ -4,6 +4,7 @@ A force is (counts - tare) / counts_per_gram. The tare is where the scale is 0; 
 that of the calibration, without any force.
 """
 
+import asyncio
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -16,7 +17,7 @@ from coordinator.modules.base import Build
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.analog_trigger import Section
-from nodes.devices.bulk_sensor import SensorError
+from nodes.devices.bulk_sensor import READINGS, SensorError
 from nodes.devices.hx71x import CHIPS, FULL_SCALE, Chip, Hx71x
 from nodes.node.node import Node
 
@@ -24,6 +25,8 @@ KEPT_S: Final = 12.0
 """So long readings are remembered: longer than LOAD_CELL_DIAGNOSTIC takes."""
 SHOWN_S: Final = 1.0
 """Of the readings that the status shows."""
+SILENT_S: Final = 1.0
+"""A message that is so late is none: no force is shown then."""
 LEAST_COUNTS: Final = 100
 """That a weight has to change readings by, for a calibration."""
 
@@ -109,10 +112,11 @@ class LoadCell:
         self.sign = -1 if build.get(ORIENTATION) == "inverted" else 1
         self.tare_counts: float | None = self.reference
         self._live: ModuleContext | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     async def connect(self, live: ModuleContext) -> None:
         """Begin to measure; raises CanductorError."""
-        self._live = live
+        self._live, self._loop = live, asyncio.get_running_loop()
         await self.sensor.begin(self.node)
 
     def end(self) -> None:
@@ -179,10 +183,16 @@ class LoadCell:
             f" {self.reference}; it can weigh {room_g:.0f} g; SAVE_CONFIG writes it"
         )
 
+    @property
+    def _is_heard(self) -> bool:
+        """Whether readings came lately."""
+        late_s = READINGS / self.sensor.rate_hz + SILENT_S
+        return self._loop is not None and self._loop.time() - self.sensor.heard_s < late_s
+
     def status(self) -> Mapping[str, Value]:
         """Report the force of the last second, as the mean and its extremes."""
-        size = round(SHOWN_S * self.sensor.rate_hz)
-        recent = [one.counts for one in list(self.sensor.readings)[-size:] if not one.error]
+        size = round(SHOWN_S * self.sensor.rate_hz) if self._is_heard else 0
+        recent = [one.counts for one in list(self.sensor.readings)[-size:] if size and not one.error]
         shown: dict[str, Value] = dict.fromkeys(("force_g", "min_force_g", "max_force_g"))
         if recent and self.is_calibrated:
             forces = [self.force_g(counts) for counts in recent]

@@ -264,7 +264,8 @@ class LoadCellProbe(Probe):
         tare = reference if self._tare is None else self._tare
         pressed = abs(reading.counts - tare) >= self._trigger_g * per_gram
         found = await self.cell.sensor.state(node, pressed=pressed)
-        self._triggered_s = self.live.print_time_of(self.cell.node_name, found.next_clock32)
+        if pressed and not found.homing:
+            self._triggered_s = self.live.print_time_of(self.cell.node_name, found.next_clock32)
         return found
 
     # ------------------------------------------------------------------------------------------ the tap
