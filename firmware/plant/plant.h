@@ -151,6 +151,7 @@ struct plant_load_cell {
     uint64_t start_ns, woken_ns, rise_ns, taken; // conversions that were read or missed
     uint32_t shown;                              // what is shifted out
     int pulses;                                  // of SCLK since it was latched
+    int missed;                                  // the pulse before, by a fault
     int gain;                                    // which the last pulses have chosen
 };
 

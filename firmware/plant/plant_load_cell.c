@@ -12,7 +12,7 @@
 // What follows the bits of a reading chooses the next one: channel A at full gain, channel B, which is not
 // connected, A at half gain, and B again.
 static const double GAINS[] = {1, 0, 0.5, 0};
-enum { BITS = 24, LEAST_PULSES = 25, SETTLE_PERIODS = 4, POINTS = 8 };
+enum { BITS = 24, LEAST_PULSES = 25, SETTLE_PERIODS = 4, POINTS = 8, MISSED = 12 };
 static const uint64_t SLEEP_NS = 500000;
 static const double FULL_SCALE = 8388607.0, NS_PER_S = 1e9;
 
@@ -87,6 +87,11 @@ void plant_load_cell_edge(struct plant *plant, struct plant_load_cell *cell, uin
     } else if (cell->pulses == 0) {
         return; // there is nothing to shift
     }
+    if (fault_of(plant, cell) == PLANT_GARBLED && cell->pulses == MISSED && !cell->missed) {
+        cell->missed = 1;
+        return;
+    }
+    cell->missed = 0;
     cell->pulses++;
 }
 

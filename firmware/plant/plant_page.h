@@ -51,7 +51,7 @@ enum plant_fault {
     PLANT_WARM,
     PLANT_OVERHEATED,
     // A load cell: OPEN or DEAD, its chip makes no readings; SHORTED, they are at full scale; NEVER, it feels
-    // nothing of the bed.
+    // nothing of the bed; GARBLED, its chip misses a pulse of each reading.
     // A coil: OPEN, its chip does not answer; DEAD, it makes no readings; SHORTED, it flags them as bad.
     // A switch stays as it is, of a BLTouch the pin; it closes a fifth of a millimetre late.
     PLANT_STUCK,

@@ -72,7 +72,7 @@ class PlantFault(IntEnum):
     ALWAYS = 7
     """A switch that is always closed."""
     GARBLED = 8
-    """A driver whose answers arrive damaged."""
+    """A driver whose answers arrive damaged; a load cell's chip that misses a pulse of each reading."""
     WARM = 9
     """A driver that reports its overtemperature warning."""
     OVERHEATED = 10
@@ -98,7 +98,13 @@ _FAULTS: Final[Mapping[PlantItemKind, tuple[PlantFault, ...]]] = {
         PlantFault.OVERHEATED,
     ),
     PlantItemKind.COIL: (PlantFault.OPEN, PlantFault.DEAD, PlantFault.SHORTED),
-    PlantItemKind.LOAD_CELL: (PlantFault.OPEN, PlantFault.DEAD, PlantFault.SHORTED, PlantFault.NEVER),
+    PlantItemKind.LOAD_CELL: (
+        PlantFault.OPEN,
+        PlantFault.DEAD,
+        PlantFault.SHORTED,
+        PlantFault.NEVER,
+        PlantFault.GARBLED,
+    ),
 }
 
 

@@ -19,6 +19,7 @@ ZERO, PER_GRAM, DEPTH_MM, STIFFNESS = -1234, 100.0, 0.05, 4000.0
 COUNTS = round(ZERO + PER_GRAM * DEPTH_MM * STIFFNESS)
 REASON, ERROR_REASON = 1, 4
 RAW_RANGE, OVERFLOW, MONITOR, LOST_COUNT = range(4)
+LOST = -(2**31)
 ABS_GE, GT, DIFF_PEAK_GT = range(3)
 SCALE_BITS, COEFF_BITS = 10, 28
 LARGER = 64
@@ -137,12 +138,18 @@ def test_a_reading_from_before_the_query_is_not_told() -> None:
     assert first > COUNTS + 10 * 5.2 * PER_GRAM
 
 
-def test_a_chip_that_has_lost_count_is_put_to_sleep_and_goes_on() -> None:
-    """The node is too slow for a conversion every 40 us: there is a new one whenever one was read."""
-    host = CellHost(rate=1000)
-    host.send("debug_nop")
-    host.query(rest_ms=20)  # the chip sleeps for so long, whose limit is half a millisecond
-    assert set(readings(host.run(host.ms(2000)))) == {COUNTS}
+def test_a_chip_that_has_lost_count_is_told_and_goes_on_when_it_has_slept() -> None:
+    """It shows a bit, which is 0, where it should have none. Then SCLK is high until the next look."""
+    host = CellHost()
+    host.query()
+    assert set(readings(host.run(host.ms(500)))) == {COUNTS}
+    host.fault(PlantFault.GARBLED)
+    lost = readings(host.run(host.ms(1500)))
+    assert set(lost) <= {COUNTS, LOST}
+    assert 10 <= lost.count(LOST) <= 24, "each time it settles for four conversions"
+    host.fault(PlantFault.SOUND)
+    host.run(host.ms(1000))
+    assert set(readings(host.run(host.ms(1000)))) == {COUNTS}
 
 
 def test_waiting_readings_count_in_the_status() -> None:
@@ -234,6 +241,16 @@ def test_the_first_reading_may_be_the_offset() -> None:
     host.home(ABS_GE, 1000)  # 10 g more than that
     assert host.triggers(950) == []
     assert host.triggers(150) == [REASON]
+
+
+def test_a_chip_that_has_lost_count_ends_homing() -> None:
+    host = CellHost()
+    host.query()
+    host.run(host.ms(100))
+    host.offset_scale(ZERO, 1)
+    host.home(GT, 50_000)
+    host.fault(PlantFault.GARBLED)
+    assert host.triggers(20) == [ERROR_REASON + LOST_COUNT]
 
 
 @pytest.mark.parametrize("what", [PlantFault.OPEN, PlantFault.DEAD])

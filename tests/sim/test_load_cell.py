@@ -145,6 +145,7 @@ HOMING = "Z was not homed: "
         (PlantFault.DEAD, "the sensor makes no readings: check its supply and its wiring"),
         (PlantFault.OPEN, "the sensor makes no readings: check its supply and its wiring"),
         (PlantFault.SHORTED, "the force left its safe range: check that nothing presses against the nozzle"),
+        (PlantFault.GARBLED, "the sensor lost count of its clock: check the wires of dout_pin and sclk_pin"),
         (PlantFault.NEVER, "the probe did not trigger within"),
     ],
 )
