@@ -37,7 +37,8 @@ class AnalogTrigger:
 
     def __init__(self, what: str, sections: Sequence[Section]) -> None:
         self._what = what
-        self._sections = sections
+        self.sections = sections
+        """Of its filter, in order."""
         self._filter_oid = self._oid = 0
         self._homing_rest_ticks = 0
 
@@ -46,7 +47,7 @@ class AnalogTrigger:
         config.require(self._what, (*COMMANDS, attach))
         self._filter_oid, self._oid = config.create_oid(), config.create_oid()
         for command in (
-            f"config_sos_filter oid={self._filter_oid} max_sections={len(self._sections)}",
+            f"config_sos_filter oid={self._filter_oid} max_sections={len(self.sections)}",
             f"config_trigger_analog oid={self._oid} sos_filter_oid={self._filter_oid}",
             f"{attach} oid={sensor_oid} trigger_analog_oid={self._oid}",
         ):
@@ -78,10 +79,10 @@ class AnalogTrigger:
         node.send(
             "sos_filter_set_active",
             oid=self._filter_oid,
-            n_sections=len(self._sections),
+            n_sections=len(self.sections),
             coeff_frac_bits=COEFF_BITS,
         )
-        for index, section in enumerate(self._sections):
+        for index, section in enumerate(self.sections):
             words = {f"sos{number}": round(word * 2**COEFF_BITS) for number, word in enumerate(section)}
             node.send("sos_filter_set_section", oid=self._filter_oid, section_idx=index, **words)
             node.send("sos_filter_set_state", oid=self._filter_oid, section_idx=index, state0=0, state1=0)

@@ -12,7 +12,11 @@ import pytest
 
 from coordinator.config.errors import ConfigError
 from coordinator.gcode.errors import GCodeError
+from coordinator.modules.module_set import build_modules
+from coordinator.modules.probes.force_filters import high_pass, low_pass, notch
+from coordinator.modules.probes.load_cell_probe import LoadCellProbe
 from coordinator.virtual_machine.plant_bed import BedSettings, LoadCellSettings
+from nodes.devices.analog_trigger import Section
 from nodes.virtual.plant import Bed
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.profiles import is_full
@@ -210,6 +214,7 @@ def test_a_force_beyond_the_limit_ends_the_way_down(tmp_path: Path) -> None:
         ({"notch_filter_frequencies": "1, many"}, "must be a number of Hz"),
         ({"notch_filter_frequencies": "1, 2, 3, 4, 5"}, "more than 4"),
         ({"drift_filter_delay": 3}, "drift_filter_delay"),
+        ({"trigger_force": 300, "force_safety_limit": 250}, "it has to be below force_safety_limit"),
         ({"x_offset": 5}, "x_offset"),
     ],
 )
@@ -387,3 +392,50 @@ def test_a_force_that_is_not_measured_any_more_is_not_shown(tmp_path: Path) -> N
     )
     found = [ast.literal_eval(text[6:])["force_g"] for text in output if text.startswith("echo: {")]
     assert found == [pytest.approx(0, abs=1), None]
+
+
+# ------------------------------------------------------------------------------------------------- options
+
+
+@pytest.mark.parametrize(
+    ("options", "sections"),
+    [
+        ({}, []),
+        ({"drift_filter_cutoff_frequency": 0.8}, [high_pass(0.8, 320, 2)]),
+        (
+            {"drift_filter_cutoff_frequency": 0.8, "drift_filter_delay": 1},
+            [high_pass(0.8, 320, 1)],
+        ),
+        ({"buzz_filter_cutoff_frequency": 100}, [low_pass(100, 320, 2)]),
+        ({"buzz_filter_cutoff_frequency": 100, "buzz_filter_delay": 1}, [low_pass(100, 320, 1)]),
+        ({"notch_filter_frequencies": "50, 60"}, [notch(50, 320, 2), notch(60, 320, 2)]),
+        ({"notch_filter_frequencies": "50", "notch_filter_quality": 3}, [notch(50, 320, 3)]),
+    ],
+)
+def test_the_filter_is_as_configured(
+    tmp_path: Path, options: dict[str, Any], sections: list[Section]
+) -> None:
+    stage = stage_with(tmp_path, sensor_type="hx717", **options)
+    (probe,) = build_modules(stage.description).of(LoadCellProbe)
+    assert probe.cell.sensor.trigger is not None
+    assert list(probe.cell.sensor.trigger.sections) == sections
+
+
+def homing_s(stage: ProbeStage) -> float:
+    """Return how long a G28 takes, s."""
+    at: list[float] = []
+    for name in ("begin", "end"):
+        stage.on_echo[name] = lambda: at.append(stage.stage.now_ns() * 1e-9)
+    stage.do("G28 X Y", "M400", "M118 begin", "G28 Z", "M118 end")
+    begin, end = at
+    return end - begin
+
+
+@pytest.mark.parametrize(
+    ("options", "more_s"), [({"pullback_speed": 0.02}, 7.5), ({"tare_time": 2}, 2 * (2 - 0.067))]
+)
+def test_what_takes_time_takes_as_long_as_configured(
+    tmp_path: Path, options: dict[str, Any], more_s: float
+) -> None:
+    usual_s = homing_s(stage_with(tmp_path))
+    assert homing_s(stage_with(tmp_path / "own", **options)) == pytest.approx(usual_s + more_s, abs=0.5)

@@ -104,7 +104,7 @@ class LoadCell:
             pulses=chip.gains[gain],
             rate=read_rate(build),
             sections=sections,
-            kept_s=max(KEPT_S, kept_s + SHOWN_S),
+            kept_s=max(KEPT_S, kept_s),
         )
         build.add_device(dout.node, self.sensor, dout)
         self.counts_per_gram = build.find(COUNTS_PER_GRAM)

@@ -30,7 +30,7 @@ from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.probing import Contact, SlowLift
 from coordinator.support.values import Value
 from nodes.devices.analog_trigger import Section
-from nodes.devices.bulk_sensor import SensorError, checked
+from nodes.devices.bulk_sensor import READINGS, SensorError, checked
 from nodes.devices.endstop import EndstopState, SensorEndstop
 from nodes.devices.hx71x import FULL_SCALE
 from nodes.node.node import Node
@@ -38,6 +38,8 @@ from nodes.support.errors import CanductorError
 
 SETTLE_S: Final = 0.1
 """Before the lift and after it: the force is measured at rest as well."""
+WAITS_S: Final = 3.0
+"""Beside the lift, readings have to be remembered for so long, and for two messages."""
 MM_PER_READING: Final = 0.001
 """Of a lift, unless pullback_speed says otherwise."""
 MAX_FORCE_G: Final = 1e5
@@ -151,11 +153,13 @@ class LoadCellProbe(Probe):
         self._pullback_mm = build.get(PULLBACK)
         self._pullback_speed = build.get_or(PULLBACK_SPEED, MM_PER_READING * rate)
         self._hums_hz = _hums(build, rate)
-        lift_s = self._pullback_mm / self._pullback_speed + 2 * SETTLE_S
-        self.cell = LoadCell(build, _sections(build, rate, self._hums_hz), kept_s=lift_s)
+        kept_s = self._pullback_mm / self._pullback_speed + 2 * READINGS / rate + WAITS_S
+        self.cell = LoadCell(build, _sections(build, rate, self._hums_hz), kept_s=kept_s)
         build.shared(LoadCellCommands).add(self.cell)
         build.shared(LoadCellProbeStatus).probe = self
         self._trigger_g, self._limit_g = build.get(TRIGGER_FORCE), build.get(SAFETY_LIMIT)
+        if self._trigger_g >= self._limit_g:
+            raise build.reader.bad(TRIGGER_FORCE, f"but it has to be below {SAFETY_LIMIT.name}")
         self._tare_s = build.get(TARE_TIME)
         self._tare: float | None = None
         self._lifted_mm = 0.0
@@ -286,20 +290,21 @@ class LoadCellProbe(Probe):
             self._lifted_mm = await move.run()
             await self.cell.mean_counts(SETTLE_S)
             await times.count()
-            readings = checked(list(self.cell.sensor.readings))
-            forces = [self.cell.force_g(reading.counts) for reading in readings]
+            all_readings = list(self.cell.sensor.readings)
+            readings = [
+                (float(at_s), reading)
+                for at_s, reading in zip(times.middles(all_readings), all_readings, strict=True)
+                if move.begin_s - SETTLE_S <= at_s <= move.end_s + SETTLE_S
+            ]
+            checked([reading for _, reading in readings])
         except SensorError as error:
             raise NotReadyError(f"[{self.name}]: {error}") from error
         finally:
             times.end()
-        near = [
-            (at_s, move.way_at(at_s), force)
-            for at_s, force in zip(times.middles(readings), forces, strict=True)
-            if move.begin_s - SETTLE_S <= at_s <= move.end_s + SETTLE_S
-        ]
+        forces = [self.cell.force_g(reading.counts) for _, reading in readings]
+        at = [at_s for at_s, _ in readings]
         try:
-            at_s, ways, forces_near = zip(*near, strict=True) if near else ((), (), ())
-            self._tap = find_tap(at_s, ways, forces_near, self._hums_hz)
+            self._tap = find_tap(at, [move.way_at(at_s) for at_s in at], forces, self._hums_hz)
         except TapError as error:
             raise NotReadyError(
                 f"[{self.name}]: {error}; the nozzle was lifted by {self._pullback_mm:g} mm, check"
@@ -325,8 +330,7 @@ class LoadCellProbe(Probe):
         timeout_s = bounded(call.command, given, "TIMEOUT", 30, low=1, high=300)
 
         async def wait() -> Done:
-            with explained(self.cell):
-                await self._take_tare()
+            await self._take_tare()
             self.live.say(f"tap the nozzle {taps} times, within {timeout_s:g} s each")
             for number in range(taps):
                 try:
