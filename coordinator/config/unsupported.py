@@ -12,7 +12,7 @@ def _words(text: str) -> tuple[str, ...]:
 UNSUPPORTED_SECTIONS = frozenset(
     (
         *_words("manual_stepper"),
-        *_words("homing_heaters temperature_probe adc_scaled ads1x1x ads1118"),
+        *_words("homing_heaters adc_scaled ads1x1x ads1118"),
         *_words("dockable_probe z_calibration tools_calibrate"),
         *_words("gcode_shell_command sdcard_loop"),
         *_words("resonance_tester shaketune adxl345 icm20948 lis2dw lis3dh bmi160 mpu9250 angle"),

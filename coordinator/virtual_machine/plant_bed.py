@@ -12,6 +12,7 @@ from coordinator.config.pins import PinOption
 from coordinator.config.sections.nodes import make_pin_registry
 from coordinator.config.sections.probe import DOUT, LOAD_CELL
 from coordinator.kinematics.delta import Delta
+from coordinator.virtual_machine.plant_heat import COIL_SENSOR, plant_word
 from nodes.devices.hx71x import CHIPS
 from nodes.support.errors import CanductorError
 from nodes.virtual import plant
@@ -152,11 +153,9 @@ def _coil(description: MachineDescription, settings: BedSettings, axes: Sequence
     """Return the coil of an eddy current probe at NODE; X, Y, Z and perhaps slopes are AXES."""
     described = description.probe
     assert described is not None
-    given = {
-        name: option.value
-        for name, option in parse_config(description.path).sections[described.section].options.items()
-    }
+    given = _options(description, described.section)
     x, y, z, *slopes = axes
+    assert described.rail.homing.endstop_pin is not None
     return Coil(
         name="probe",
         bus=_BUSES.index(given.get("i2c_bus", _BUSES[0])),
@@ -170,6 +169,7 @@ def _coil(description: MachineDescription, settings: BedSettings, axes: Sequence
         offset_x=described.offset[0],
         offset_y=described.offset[1],
         intb_pin=_bare(given["intb_pin"]) if "intb_pin" in given else None,
+        body=_coil_body(description, described.section, described.rail.homing.endstop_pin.node),
         clock=float(given.get("frequency", "12e6")) * settings.coil_clock,
         drift=settings.coil_drift,
         noise=settings.coil_noise_hz,
@@ -218,6 +218,19 @@ def _cell(name: str, section: RawSection, settings: BedSettings) -> LoadCell:
         hum_hz=cell.hum_hz,
         noise=cell.noise,
     )
+
+
+def _options(description: MachineDescription, section: str) -> dict[str, str]:
+    """Return what is given in SECTION; none where it is not there."""
+    found = parse_config(description.path).sections.get(section)
+    return {} if found is None else {name: option.value for name, option in found.options.items()}
+
+
+def _coil_body(description: MachineDescription, section: str, node: str) -> str | None:
+    """Return the body that warms the coil of SECTION on NODE; None: it is as warm as the air."""
+    sensor = f"{COIL_SENSOR} {section.partition(' ')[2]}"
+    pin = _options(description, sensor).get("sensor_pin")
+    return plant_word(sensor) if pin is not None and _CONTROL.parse(pin).node == node else None
 
 
 def _bare(pin: str) -> str:

@@ -78,6 +78,13 @@ BED: Final = _Thing(power=250.0, capacity=450.0, loss=1.6, lag=2.0)
 OTHER: Final = _Thing(power=100.0, capacity=150.0, loss=0.5, lag=2.0)
 AIR_CAPACITY: Final = 100.0
 """Of what a sensor without heater hangs in."""
+AIR_LOSS: Final = 1.0
+COIL_SENSOR: Final = "temperature_probe"
+"""First word of the sections of sensors that are in the coil of an eddy current probe."""
+COIL_CAPACITY: Final = 400.0
+BED_BODY: Final = "heater_bed"
+COIL_TO_BED: Final = 1.0
+"""W/K: half of what the bed is warmer than the air, in the end."""
 
 _POINTS: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
     "EPCOS 100K B57560G104F": ((25, 100_000), (150, 1641.9), (250, 226.15)),
@@ -126,7 +133,7 @@ def machine_heat(description: MachineDescription, settings: HeatSettings) -> dic
     maker = _Maker(config, make_pin_registry(config, description.nodes), heat, settings)
     for section in config.sections.values():
         maker.add(section)
-    maker.blow()
+    maker.join()
     return heat
 
 
@@ -155,6 +162,7 @@ class _Maker:
         self._settings = settings
         self._blown: list[tuple[str, str, float]] = []  # node, body and conductance of the part fan
         self._part_fans: list[tuple[str, str]] = []  # node and name
+        self._coils: list[tuple[str, str]] = []  # node and body of those of eddy current probes
 
     def add(self, section: RawSection) -> None:
         """Take SECTION, if it is one of heat or fans."""
@@ -166,8 +174,11 @@ class _Maker:
         if _is_fan(section) and (pin := self._pin(section, "pin")):
             self._add_fan(section, name, pin)
 
-    def blow(self) -> None:
-        """Let the part fans blow at hotends; to be called when all is there."""
+    def join(self) -> None:
+        """Let part fans blow at hotends, and the bed warm coils; to be called when all is there."""
+        for node, coil in self._coils:
+            if any(body.name == BED_BODY for body in self._heat[node].bodies):
+                self._heat[node].couples.append(Couple(a=BED_BODY, b=coil, conductance=COIL_TO_BED))
         for node, body, conductance in self._blown:
             self._heat[node].coolings.extend(
                 Cooling(body=body, node=at, fan=fan, conductance=conductance) for at, fan in self._part_fans
@@ -198,7 +209,11 @@ class _Maker:
             return
         if body_node is None:
             body_node = pin.node
-            self._heat[pin.node].bodies.append(Body(name=name, capacity=AIR_CAPACITY, loss=1.0))
+            capacity = AIR_CAPACITY
+            if section.kind == COIL_SENSOR:
+                capacity = COIL_CAPACITY / self._settings.hurry
+                self._coils.append((pin.node, name))
+            self._heat[pin.node].bodies.append(Body(name=name, capacity=capacity, loss=AIR_LOSS))
         self._heat[pin.node].sensors.append(
             Sensor(
                 name=name,

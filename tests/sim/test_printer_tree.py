@@ -124,7 +124,14 @@ def test_the_page_tells_all_that_there_is(tmp_path: Path) -> None:
             "screws_tilt_adjust",
             "z_tilt",
             "quad_gantry_level",
-        } | {"z_tilt_ng", "z_thermal_adjust", "endstop_phase", "load_cell", "load_cell_probe"}
+        } | {
+            "z_tilt_ng",
+            "z_thermal_adjust",
+            "endstop_phase",
+            "load_cell",
+            "load_cell_probe",
+            "temperature_probe",
+        }
         elsewhere = {
             "gcode_macro",
             "extruder1",

@@ -18,6 +18,7 @@ from coordinator.gcode.parameters import bounded, flag
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID, TemperatureSensor
+from coordinator.support.low_pass import LowPass
 from coordinator.support.values import Value
 
 STEEPEST: Final = 1.0
@@ -78,11 +79,9 @@ class ZThermalAdjust(TemperatureSensor):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self._coeff, self._smooth_s = build.get(TEMP_COEFF), build.get(SMOOTH_TIME)
+        self._coeff, self._smoothed = build.get(TEMP_COEFF), LowPass(build.get(SMOOTH_TIME))
         self._off_above, self._most = build.get(OFF_ABOVE), build.get(MOST)
         self._enabled = True
-        self._smoothed: tuple[float, float] | None = None
-        """When that was (print time, s), and how warm, °C."""
         self._reference_c: float | None = None
         """When Z was homed; None: it was not."""
         self._shift_mm = 0.0
@@ -112,9 +111,9 @@ class ZThermalAdjust(TemperatureSensor):
 
     def shift_at(self, z_mm: float) -> float:
         """Return how much higher Z has to be for what is planned next at Z_MM; in the reader's thread."""
-        reference, smoothed = self._reference_c, self._smoothed
+        reference, smoothed = self._reference_c, self._smoothed.value
         if self._enabled and reference is not None and smoothed is not None and z_mm <= self._off_above:
-            wanted = -self._coeff * (smoothed[1] - reference)
+            wanted = -self._coeff * (smoothed - reference)
             wanted = min(max(wanted, -self._most), self._most)
             if abs(wanted - self._shift_mm) >= LEAST_MM:
                 self._shift_mm = wanted
@@ -122,16 +121,12 @@ class ZThermalAdjust(TemperatureSensor):
 
     def _measured(self, at_s: float, celsius: float) -> None:
         super()._measured(at_s, celsius)
-        if self._smoothed is not None and at_s > self._smoothed[0]:
-            before_s, before_c = self._smoothed
-            past_s = at_s - before_s
-            celsius = before_c + (celsius - before_c) * past_s / (past_s + self._smooth_s)
-        self._smoothed = at_s, celsius
+        self._smoothed.take(at_s, celsius)
 
     def _homed(self, axes: str) -> None:
         if "Z" in axes:
             self._shift_mm = 0.0
-            self._reference_c = None if self._smoothed is None else self._smoothed[1]
+            self._reference_c = self._smoothed.value
 
     def _read(self, call: Call) -> Reading:
         command, given = call.command, call.parameters("ENABLE", "TEMP_COEFF", "REF_TEMP")

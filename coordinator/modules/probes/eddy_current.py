@@ -9,7 +9,7 @@ import contextlib
 import statistics
 from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Protocol
 
 import numpy as np
 
@@ -112,6 +112,21 @@ OPTIONS: Final[tuple[Option[Any], ...]] = (
 )
 
 
+class Compensation(Protocol):
+    """Corrects frequencies of a coil for its temperature."""
+
+    def to_calibrated(self, frequency_hz: float) -> float:
+        """Return what a frequency of now would have been when the table was calibrated, Hz."""
+        ...
+
+    def from_calibrated(self, frequency_hz: float) -> float:
+        """Return what a frequency of the table would be now, Hz."""
+        ...
+
+    def table_calibrated(self) -> None:
+        """Note that the table has been calibrated just now."""
+
+
 class EddyProbe(Probe):
     """The probe of [probe_eddy_current NAME]; for homing moves also the sensor in the place of an endstop."""
 
@@ -152,6 +167,8 @@ class EddyProbe(Probe):
         self.sensor.drive = build.find(DRIVE)
         self._flight: _Flight | None = None
         self.table: EddyTable | None = build.find(CALIBRATE)
+        self.compensation: Compensation | None = None
+        """What corrects frequencies for the temperature of the coil; None: nothing does."""
         build.add_device(self.node_name, self.sensor, intb)
         for name, text, read in (
             (
@@ -246,7 +263,10 @@ class EddyProbe(Probe):
     async def state(self, node: Node) -> EndstopState:
         """Measure whether it is triggered; raises CanductorError."""
         with self.explained():
-            self.sensor.threshold_hz = self.calibrated().frequency(self.offset[2])
+            threshold_hz = self.calibrated().frequency(self.offset[2])
+            if self.compensation is not None:
+                threshold_hz = self.compensation.from_calibrated(threshold_hz)
+            self.sensor.threshold_hz = threshold_hz
             return await self.sensor.state(node)
 
     def touching(self, *, alone: bool) -> AbstractAsyncContextManager[None]:
@@ -267,7 +287,14 @@ class EddyProbe(Probe):
         """Measure how high the nozzle is above the bed below the coil; raises NotReadyError."""
         frequency = await self.frequency()
         with self.explained():
-            return self.calibrated().height(frequency)
+            return self.height(frequency)
+
+    def height(self, frequency_hz: float) -> float:
+        """Return the height of the nozzle at a measured frequency, mm; raises CanductorError."""
+        table = self.calibrated()
+        if self.compensation is not None:
+            frequency_hz = self.compensation.to_calibrated(frequency_hz)
+        return table.height(frequency_hz)
 
     async def frequency(self) -> float:
         """Measure the frequency of the coil where the head stands, Hz; raises NotReadyError."""
@@ -407,7 +434,23 @@ class EddyProbe(Probe):
         return self._manual.follow(call, accepted)
 
     def _calibrate(self, job: ProgramContext, command: Command, touched: Point) -> Iterator[Reading]:
-        """Measure frequencies above the place where the nozzle TOUCHED the bed."""
+        points = yield from self.measure_above(job, command, touched, HEIGHTS)
+        if points:
+            yield AtStandstill(lambda: self._keep_table(points))
+
+    def measure_above(
+        self,
+        job: ProgramContext,
+        command: Command,
+        touched: Point,
+        heights: Sequence[float],
+        on_measured: Callable[[], None] = lambda: None,
+    ) -> Generator[Reading, None, list[tuple[float, float]]]:
+        """Measure frequencies at HEIGHTS (mm, rising) above the place where the nozzle TOUCHED the bed.
+
+        Returns true heights and frequencies, the highest first; none: it is only planned. ON_MEASURED is
+        called for each, on the control loop.
+        """
         zero: list[float] = []
         points: list[tuple[float, float]] = []
 
@@ -419,7 +462,7 @@ class EddyProbe(Probe):
 
         yield AtStandstill(note_zero)
         if not zero:
-            return
+            return points
         x, y, z = touched
         speed = self.measuring.lift_speed
         yield from lift(job, z + CALIBRATE_LIFT_MM, speed)
@@ -432,13 +475,14 @@ class EddyProbe(Probe):
             place = await place_by_steps(self.live.machine)
             assert place is not None
             points.append((place[2] - zero[0], frequency))
+            on_measured()
             return Done()
 
-        for height in reversed(HEIGHTS):
+        for height in reversed(heights):
             yield from lift(job, z + height, speed)
             yield AtStandstill(measure)
         yield from lift(job, z + CALIBRATE_LIFT_MM, speed)
-        yield AtStandstill(lambda: self._keep_table(points))
+        return points
 
     async def _keep_table(self, points: Sequence[tuple[float, float]]) -> Done:
         try:
@@ -448,6 +492,8 @@ class EddyProbe(Probe):
                 f"PROBE_EDDY_CURRENT_CALIBRATE failed: {error}; check that the coil is above metal"
             ) from error
         self.table = table
+        if self.compensation is not None:
+            self.compensation.table_calibrated()
         self.live.save(self.name, CALIBRATE.name, table.text())
         (low, highest_hz), (high, lowest_hz) = table.points[0], table.points[-1]
         found = f"{lowest_hz:.0f} to {highest_hz:.0f} Hz from {high:.2f} down to {low:.2f} mm"
@@ -487,8 +533,7 @@ class _Flight:
                 await times.count()
                 readings = checked(list(probe.sensor.readings))
                 at_s = times.middles(readings)
-                table = probe.calibrated()
-                heights = [table.height(reading.frequency_hz) for reading in readings]
+                heights = [probe.height(reading.frequency_hz) for reading in readings]
                 found = [height_at(time_s - at_s, heights) for time_s in passed]
         finally:
             self.end()

@@ -50,6 +50,8 @@ class ManualProbe(Module):
         """What a height that is accepted leads to; None: nothing is looked for."""
         self._then: Then | None = None
         """What follows a height that is accepted, where others are looked for after it."""
+        self._asked_by: TakesAnswers | None = None
+        """The dialogue that the search is part of, and which ends with it."""
         self.others: list[TakesAnswers] = []
         """Other dialogues, such as that for the turns of screws."""
         self._speed = SPEED
@@ -123,15 +125,20 @@ class ManualProbe(Module):
             )
         return self.begin(call, accepted, speed)
 
-    def check_free(self, call: Call) -> None:
-        """Raise WordError where no height can be looked for."""
+    def check_free(self, call: Call, asked_by: TakesAnswers | None = None) -> None:
+        """Raise WordError where no height can be looked for, as part of the dialogue ASKED_BY."""
         if "Z" not in call.homed:
             raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
-        self.check_no_dialogue(call)
+        self.check_no_dialogue(call, asked_by)
 
-    def check_no_dialogue(self, call: Call) -> None:
-        """Raise WordError where ACCEPT and ABORT have a meaning already."""
-        if self._accepted is not None or self._other is not None:
+    @property
+    def is_searching(self) -> bool:
+        """Whether a height is looked for."""
+        return self._accepted is not None
+
+    def check_no_dialogue(self, call: Call, asked_by: TakesAnswers | None = None) -> None:
+        """Raise WordError where ACCEPT and ABORT have a meaning already, but for the dialogue ASKED_BY."""
+        if self.is_searching or self._other not in (None, asked_by):
             raise WordError(f"{call.command.name}: a height is looked for already; ACCEPT or ABORT that")
 
     @property
@@ -148,20 +155,28 @@ class ManualProbe(Module):
         """
         return self._begin(call, accepted, None, speed)
 
-    def follow(self, call: Call, then: Then, speed: float = SPEED) -> Reading:
+    def follow(
+        self, call: Call, then: Then, speed: float = SPEED, *, asked_by: TakesAnswers | None = None
+    ) -> Reading:
         """Return what begins to look for a height, which THEN goes on from; raises WordError.
 
-        TESTZ goes at SPEED, mm/s.
+        TESTZ goes at SPEED, mm/s. ASKED_BY: the dialogue that it is part of.
         """
-        return self._begin(call, lambda _: (), then, speed)
+        return self._begin(call, lambda _: (), then, speed, asked_by)
 
     def _begin(
-        self, call: Call, accepted: Callable[[float], tuple[str, ...]], then: Then | None, speed: float
+        self,
+        call: Call,
+        accepted: Callable[[float], tuple[str, ...]],
+        then: Then | None,
+        speed: float,
+        asked_by: TakesAnswers | None = None,
     ) -> Reading:
-        self.check_free(call)
+        self.check_free(call, asked_by)
 
         def act(job: ProgramContext) -> bool:
             self._accepted, self._then, self._speed, self._tried = accepted, then, speed, []
+            self._asked_by = asked_by
             job.emit(Reply(job.line, _BEGUN))
             self._tell(job)
             return True
@@ -244,7 +259,13 @@ class ManualProbe(Module):
             self._accepted = self._then = None
             return Done((f"nothing is kept; Z stays at {call.position[2]:.3f}",))
 
-        return AtStandstill(abort)
+        def run(_: ProgramContext) -> Iterator[Reading]:
+            asked_by = self._asked_by
+            yield AtStandstill(abort)
+            if asked_by is not None:
+                yield asked_by.read_abort(call)
+
+        return Phases(run)
 
     def _check_active(self, call: Call) -> Callable[[float], tuple[str, ...]]:
         if self._accepted is None:

@@ -48,6 +48,7 @@ class TemperatureSensor(SensorModule):
 
     async def connect(self, live: "ModuleContext") -> None:
         """Start measuring."""
+        await super().connect(live)
         await self.input.connect(live)
 
     def end(self, cause: str) -> None:
