@@ -14,7 +14,7 @@ import pytest
 
 from coordinator.config.errors import ConfigError
 from coordinator.gcode.errors import GCodeError
-from coordinator.modules.probes.eddy_current import EddyProbe
+from coordinator.modules.eddy_current.eddy_probe import EddyProbe
 from coordinator.runtime.machine import Machine
 from coordinator.virtual_machine.plant_bed import BedSettings
 from nodes.devices.ldc1612 import Ldc1612

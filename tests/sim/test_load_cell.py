@@ -12,9 +12,9 @@ import pytest
 
 from coordinator.config.errors import ConfigError
 from coordinator.gcode.errors import GCodeError
+from coordinator.modules.load_cells.force_filters import high_pass, low_pass, notch
+from coordinator.modules.load_cells.load_cell_probe import LoadCellProbe
 from coordinator.modules.module_set import build_modules
-from coordinator.modules.probes.force_filters import high_pass, low_pass, notch
-from coordinator.modules.probes.load_cell_probe import LoadCellProbe
 from coordinator.virtual_machine.plant_bed import BedSettings, LoadCellSettings
 from nodes.devices.analog_trigger import Section
 from nodes.virtual.plant import Bed

@@ -13,7 +13,7 @@ import pytest
 
 from coordinator.config.errors import ConfigError
 from coordinator.gcode.errors import GCodeError
-from coordinator.modules.probes.coil_drift import HEIGHTS
+from coordinator.modules.eddy_current.coil_drift import HEIGHTS
 from coordinator.virtual_machine.plant_bed import BedSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.virtual.plant import Bed

@@ -15,7 +15,7 @@ from coordinator.gcode.events import Done
 from coordinator.gcode.parameters import bounded
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.modules.probes.load_cell import CELL_OPTIONS, UNSUPPORTED, LoadCell
+from coordinator.modules.load_cells.load_cell import CELL_OPTIONS, UNSUPPORTED, LoadCell
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value

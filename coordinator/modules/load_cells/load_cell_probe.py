@@ -19,13 +19,13 @@ from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parameters import bounded
 from coordinator.modules.base import Build, Module
-from coordinator.modules.probes.force_filters import high_pass, low_pass, notch
-from coordinator.modules.probes.load_cell import CELL_OPTIONS, UNSUPPORTED, LoadCell, read_rate
-from coordinator.modules.probes.load_cell_commands import LoadCellCommands, explained
+from coordinator.modules.load_cells.force_filters import high_pass, low_pass, notch
+from coordinator.modules.load_cells.load_cell import CELL_OPTIONS, UNSUPPORTED, LoadCell, read_rate
+from coordinator.modules.load_cells.load_cell_commands import LoadCellCommands, explained
+from coordinator.modules.load_cells.tap import Tap, TapError, find_tap
 from coordinator.modules.probes.probe import LINE_OPTIONS, MEASURING_OPTIONS, NotReadyError, Probe
 from coordinator.modules.probes.probe_commands import ProbeCommands
 from coordinator.modules.probes.reading_times import ReadingTimes
-from coordinator.modules.probes.tap import Tap, TapError, find_tap
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.probing import Contact, SlowLift
 from coordinator.support.values import Value

@@ -26,8 +26,8 @@ from coordinator.gcode.parameters import bounded, flag
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module
-from coordinator.modules.probes.coil_drift import HEIGHTS, LEAST, CoilDrift, Sample, drift_of
-from coordinator.modules.probes.eddy_current import EddyProbe
+from coordinator.modules.eddy_current.coil_drift import HEIGHTS, LEAST, CoilDrift, Sample, drift_of
+from coordinator.modules.eddy_current.eddy_probe import EddyProbe
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.probes.probe import lift
 

@@ -31,7 +31,7 @@ from coordinator.gcode.events import Done
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build
-from coordinator.modules.probes.eddy_table import HEIGHTS, EddyTable, TableOption, table_of
+from coordinator.modules.eddy_current.eddy_table import HEIGHTS, EddyTable, TableOption, table_of
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.probes.probe import (
     MEASURING_OPTIONS,

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from coordinator.modules.probes.force_filters import high_pass, low_pass, notch
-from coordinator.modules.probes.tap import TapError, find_tap
+from coordinator.modules.load_cells.force_filters import high_pass, low_pass, notch
+from coordinator.modules.load_cells.tap import TapError, find_tap
 from nodes.devices.analog_trigger import Section
 
 RATE = 320.0

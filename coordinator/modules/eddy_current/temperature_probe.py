@@ -15,15 +15,15 @@ from coordinator.config.sections.sensor_options import (
     UNSUPPORTED_SENSOR_OPTIONS,
 )
 from coordinator.modules.base import Build, Modules
-from coordinator.modules.probes.coil_drift import CoilDrift, DriftOption
-from coordinator.modules.probes.drift_calibration import (
+from coordinator.modules.eddy_current.coil_drift import CoilDrift, DriftOption
+from coordinator.modules.eddy_current.drift_calibration import (
     BED_TEMP,
     EXTRUDER_TEMP,
     PROCEDURE_OPTIONS,
     DriftCalibration,
     procedure_of,
 )
-from coordinator.modules.probes.eddy_current import EddyProbe
+from coordinator.modules.eddy_current.eddy_probe import EddyProbe
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID, TemperatureSensor
 from coordinator.support.low_pass import LowPass
 from coordinator.support.values import Value
