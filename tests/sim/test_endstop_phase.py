@@ -7,6 +7,7 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
+from coordinator.support.examples import EXAMPLES
 from tests.stages.printer_text import section
 from tests.stages.probe_stage import MICROSTEP_MM, ProbeStage, machine_text
 
@@ -16,9 +17,11 @@ DRIVER = section("tmc2209 stepper_z", uart_pin="PE8", run_current=0.8)
 HOMINGS = 8
 
 
-def make(folder: Path, sections: str, direction: str = "PB7") -> ProbeStage:
+def make(folder: Path, sections: str, direction: str = "PB7", endstop_mm: float = 5) -> ProbeStage:
     folder.mkdir(exist_ok=True)
-    text = machine_text(z=SWITCH, sections=sections).replace("dir_pin: PB7", f"dir_pin: {direction}")
+    text = machine_text(z={**SWITCH, "position_endstop": endstop_mm}, sections=sections).replace(
+        "dir_pin: PB7", f"dir_pin: {direction}"
+    )
     assert f"dir_pin: {direction}" in text
     return ProbeStage(folder, text, switch_noise_mm=NOISE_MM)
 
@@ -65,6 +68,26 @@ def test_the_phase_is_calibrated_and_kept(tmp_path: Path) -> None:
     assert abs(steps[1] - steps[0]) == pytest.approx(8, abs=0.1)
 
 
+@pytest.mark.parametrize("align", [True, False])
+@pytest.mark.parametrize(("driver", "full_step"), [(DRIVER, 8), ("", 0)], ids=["told", "counted"])
+@pytest.mark.parametrize("direction", ["PB7", "!PB7"])
+@pytest.mark.parametrize("endstop_mm", [5.0, 5.0123])
+def test_zero_is_at_a_full_step(
+    tmp_path: Path, *, align: bool, driver: str, full_step: int, direction: str, endstop_mm: float
+) -> None:
+    """Which is where both coils have the same current: 8 of 16 phases of MSCNT, or as the driver began."""
+    phase = section("endstop_phase stepper_z", trigger_phase="3/64", endstop_align_zero=align)
+    stage = make(tmp_path, driver + phase, direction, endstop_mm)
+    counts: list[int] = []
+
+    def look() -> None:
+        counts.append(stage.page("mcu").motors["stepper_z"].count)
+
+    stage.on_echo["zero"] = look
+    stage.do("G28", "G1 Z0 F600", "M400", "M118 zero")
+    assert [count % 16 == full_step for count in counts] == [align], counts
+
+
 def test_a_switch_that_is_worse_than_it_may_be_is_an_error(tmp_path: Path) -> None:
     sections = DRIVER + section("endstop_phase stepper_z", endstop_accuracy=0.01)
     with pytest.raises(Exception, match=r"the endstop of stepper_z switched at phase \d+/64 of its driver"):
@@ -90,4 +113,12 @@ def test_a_wrong_section_is_refused(tmp_path: Path, written: str, said: str) -> 
     path = tmp_path / "printer.cfg"
     path.write_text(machine_text(z=SWITCH, sections=written))
     with pytest.raises(ConfigError, match=said):
+        load_machine(str(path))
+
+
+def test_the_tower_of_a_delta_has_no_zero_to_align(tmp_path: Path) -> None:
+    path = tmp_path / "printer.cfg"
+    phase = section("endstop_phase stepper_a", endstop_align_zero=True)
+    path.write_text((EXAMPLES / "delta.cfg").read_text(encoding="utf-8") + phase)
+    with pytest.raises(ConfigError, match=r"'endstop_align_zero' .* is 'True', which is for X, Y and Z"):
         load_machine(str(path))

@@ -15,18 +15,20 @@ from typing import ClassVar, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import StepperDescription
-from coordinator.config.options import BadValue, FloatOption, Option, SectionSpec
+from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
+from coordinator.config.sections.probe import NAME as PROBE
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.drivers.tmc_driver import TmcDriver
 from coordinator.modules.homing.homing import Homing
+from coordinator.modules.homing.homing_plan import AXES
 from coordinator.runtime.moves.homing import HomingError, HomingResult
 from coordinator.support.quoting import nearest_or_all
 from coordinator.support.values import Value
 
 FULL_STEPS: Final = 4
-"""Of a cycle."""
+"""Of a cycle. Both coils have the same current there: with a driver's MSCNT in the middle of each quarter."""
 MSCNT_CYCLE: Final = 1024
 """What the driver counts in a cycle (data sheets of TMC2208 and TMC2209, register MSCNT)."""
 
@@ -63,6 +65,12 @@ ACCURACY: Final = FloatOption(
 TRIGGER_PHASE: Final = PhaseOption(
     name="trigger_phase",
     help="the phase at which the switch closes, of how many; without it that of the first homing",
+)
+
+ALIGN_ZERO: Final = BoolOption(
+    name="endstop_align_zero",
+    help="take position_endstop for up to half a full step more or less, so that 0 is at a full step",
+    default=False,
 )
 
 
@@ -131,8 +139,7 @@ class EndstopPhase(Module):
     NAMELESS: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         "Makes an endstop exact to the step, by the phase of its motor's driver",
-        (ACCURACY, TRIGGER_PHASE),
-        unsupported=("endstop_align_zero",),
+        (ACCURACY, TRIGGER_PHASE, ALIGN_ZERO),
     )
 
     def __init__(self, build: Build) -> None:
@@ -142,16 +149,24 @@ class EndstopPhase(Module):
         self._driver: TmcDriver | None = None
         self._seen: tuple[int, int] | None = None
         self._stepper: StepperDescription | None = None
+        self._align_to_mm: float | None = None
+        """Where the endstop is, of an axis whose 0 is to be at a full step."""
         if not build.reader.section.instance:
             return
-        first = {rail.steppers[0].name: rail.steppers[0] for rail in build.machine.stops if rail.steppers}
+        stops = [rail for rail in build.machine.stops if rail.steppers and rail.axis != PROBE]
+        first = {rail.steppers[0].name: rail for rail in stops}
         if build.instance not in first:
             raise ConfigError(
                 build.place,
                 f"[{build.name}] names a stepper without an endstop on a pin"
                 f"{nearest_or_all(build.instance, first)}",
             )
-        self._stepper = first[build.instance]
+        rail = first[build.instance]
+        self._stepper = rail.steppers[0]
+        if build.get(ALIGN_ZERO):
+            if rail.axis not in AXES:
+                raise build.reader.bad(ALIGN_ZERO, "which is for X, Y and Z: no 0 is at the 0 of this rail")
+            self._align_to_mm = rail.homing.position_endstop
 
     def link(self, modules: Modules) -> None:
         """Find the driver, and correct what homing finds."""
@@ -189,7 +204,16 @@ class EndstopPhase(Module):
                 f" {wanted}/{phases} was expected: that is more than endstop_accuracy; check the switch, or"
                 " ENDSTOP_PHASE_CALIBRATE again"
             )
-        return sense * off * forward * stepper.step_distance
+        return sense * (off + self._off_zero(wanted, sense)) * forward * stepper.step_distance
+
+    def _off_zero(self, wanted: int, sense: int) -> float:
+        """Return by how many phases the 0 of the axis is beyond the nearest full step, if that counts."""
+        stepper = self._stepper
+        if stepper is None or self._align_to_mm is None:
+            return 0.0
+        at_zero = wanted - sense * self._align_to_mm / stepper.step_distance
+        full_step = 0 if self._driver is None else stepper.microsteps // 2
+        return math.remainder(at_zero - full_step, stepper.microsteps)
 
     def _sense(self, stepper: StepperDescription, count: int, mscnt: int) -> int:
         """Return whether the driver's phase grows with the node's count (1), or falls (-1)."""
