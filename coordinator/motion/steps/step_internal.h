@@ -63,18 +63,15 @@ struct stepper {
 
     // A stepper whose steps are not those of one move after the other: see step_curve.c.
     bool curve;
-    bool follows_bed;              // its place depends on the shape of the bed
-    bool between;                  // linear, over a bed, and never beyond places of its axes
-    double known_at[3], known_off; // X Y Z where that was last evaluated, and how far from its steps it was
-    double known_slope[2];         // of the bed there, by X and Y
-    uint64_t passed;               // the move that the next try to pass whole moves begins with
-    double stay;                   // s, up to which such a try is in vain
-    unsigned uses;                 // axes, a bit each
-    double time, border;           // s: solved up to; to be solved up to
-    double checked;                // s, where it was last seen to be where it should; -1: nowhere
-    double reach, lag;             // s: how far it sees ahead; how long it moves on
-    double smooth_s, angle;        // angle: the last one, rad
-    double crossed;                // s, when it came a tie's width beyond a boundary, still to be decided
+    bool follows_bed;       // its place depends on the shape of the bed
+    bool between;           // linear, over a bed, and never beyond places of its axes
+    uint64_t passed;        // the first move that it may still see
+    unsigned uses;          // axes, a bit each
+    double time, border;    // s: solved up to; to be solved up to
+    double checked;         // s, where it was last seen to be where it should; -1: nowhere
+    double reach, lag;      // s: how far it sees ahead; how long it moves on
+    double smooth_s, angle; // angle: the last one, rad
+    double crossed;         // s, when it came a tie's width beyond a boundary, still to be decided
     int crossed_direction;
     uint64_t cursor[STEP_TAPS + 3]; // moves; the last three are of the smoothing window
     struct seen seen[STEP_TAPS + 3];

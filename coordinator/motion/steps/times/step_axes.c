@@ -65,9 +65,7 @@ void step_forget(struct stepper *s) {
     for (int i = 0; i < STEP_TAPS + 3; i++)
         s->seen[i].border = -HUGE_VAL;
     s->trusted = 0;
-    s->known_off = HUGE_VAL;
     s->passed = 0;
-    s->stay = -HUGE_VAL;
 }
 
 static void add_tap(struct step_gen *gen, int axis, double amplitude, double time) {

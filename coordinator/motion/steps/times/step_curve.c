@@ -14,7 +14,9 @@ static const double EXACT_S = 1e-10; // of a solution
 static const int ITERATIONS = 80;
 static const double CLOSE_S = 1e-8; // a change by Newton after which the next would be far below EXACT_S
 enum { NEWTONS = 4, SOLVED = 256 };
-static const double LEVEL_MM = 1e-9; // less is rounding of a Z that stays
+static const double LEVEL_MM = 1e-9;             // less is rounding of a Z that stays
+static const double ROOM = 0.5 - 2.0 / STEP_TIE; // steps that a stepper may be off before one may be decided
+static const double SURE = 0.9; // of the time to a step: the rest is for the bends of the bed
 
 struct piece {
     double begin, seconds;
@@ -116,6 +118,8 @@ static void look_at_axes(const struct step_gen *gen, struct stepper *s, int inde
     step_locate(gen, &s->cursor[index], s->time - tap->time, &m);
     *seen = (struct seen){.time = s->time, .border = m.border + tap->time, .still = true};
     for (int j = AXIS_X; j <= AXIS_Z; j++) {
+        if (!(tap->axes & 1u << j))
+            continue;
         const double v = speed_of(&m, j), a = accel_of(&m, j), share = tap->amplitude[j];
         seen->axis[j][0] = share * place_of(&m, j);
         seen->axis[j][1] = share * v;
@@ -124,7 +128,7 @@ static void look_at_axes(const struct step_gen *gen, struct stepper *s, int inde
     }
 }
 
-// The axes of a stepper over a bed, as ``add_taps`` does: there may be many pieces between two of its steps.
+// The axes of a stepper over a bed, as ``add_taps`` does.
 static double add_seen_axes(const struct step_gen *gen, struct stepper *s, struct piece *p) {
     double end = HUGE_VAL;
     for (int i = 0; i < gen->tap_count; i++) {
@@ -135,6 +139,8 @@ static double add_seen_axes(const struct step_gen *gen, struct stepper *s, struc
             look_at_axes(gen, s, i);
         const double t = s->time - seen->time;
         for (int j = AXIS_X; j <= AXIS_Z; j++) {
+            if (!(gen->taps[i].axes & 1u << j))
+                continue;
             const double a = seen->axis[j][2];
             p->axis[j][0] += seen->axis[j][0] + t * (seen->axis[j][1] + t * a);
             p->axis[j][1] += seen->axis[j][1] + 2 * t * a;
@@ -170,6 +176,46 @@ static double add_axes(const struct step_gen *gen, struct stepper *s, struct pie
     return end;
 }
 
+struct range {
+    double low, high;
+};
+
+static double lower(double a, double b) {
+    return a < b ? a : b;
+}
+
+static double higher(double a, double b) {
+    return a > b ? a : b;
+}
+
+// Of an axis between two times; it turns once at most.
+static struct range range_of(const double c[3], double from, double to) {
+    const double first = c[0] + from * (c[1] + from * c[2]), last = c[0] + to * (c[1] + to * c[2]);
+    struct range r = {lower(first, last), higher(first, last)};
+    const double turn = -c[1] / (2 * c[2]); // not finite in a cruise
+    if (turn > from && turn < to) {
+        const double at = c[0] + turn * (c[1] + turn * c[2]);
+        r = (struct range){lower(r.low, at), higher(r.high, at)};
+    }
+    return r;
+}
+
+// Over one place of the bed a stepper's way is as straight as Z's own.
+static void straighten(const struct step_gen *gen, const struct stepper *s, struct piece *p) {
+    const double *x = p->axis[AXIS_X], *y = p->axis[AXIS_Y];
+    if (p->still || x[1] != 0 || x[2] != 0 || y[1] != 0 || y[2] != 0)
+        return;
+    const struct range z = range_of(p->axis[AXIS_Z], 0, p->seconds);
+    if (!step_surface_is_smooth(&gen->surface, x[0], x[0], y[0], y[0], z.low, z.high))
+        return;
+    double speed;
+    p->poly[0] = evaluate(gen, s, p, 0, &speed);
+    for (int k = 1; k < 3; k++)
+        for (int i = 0; i < AXES; i++)
+            p->poly[k] += s->config.weights[i] * p->axis[i][k] / s->config.step_distance;
+    p->linear = true;
+}
+
 static void make_piece(const struct step_gen *gen, struct stepper *s, double until, struct piece *p) {
     *p = (struct piece){.begin = s->time, .linear = !s->config.formula && !s->follows_bed, .still = true};
     p->smooth = p->linear && s->smooth_s > 0 && s->uses & USES_E;
@@ -191,33 +237,26 @@ static void make_piece(const struct step_gen *gen, struct stepper *s, double unt
     if (p->linear)
         p->poly[0] -= s->origin;
     p->seconds = fmax(end - s->time, ROUNDING_S / 2);
-}
-
-struct range {
-    double low, high;
-};
-
-// Of an axis between two times; it turns once at most.
-static struct range range_of(const double c[3], double from, double to) {
-    const double first = c[0] + from * (c[1] + from * c[2]), last = c[0] + to * (c[1] + to * c[2]);
-    struct range r = {fmin(first, last), fmax(first, last)};
-    const double turn = -c[1] / (2 * c[2]); // not finite in a cruise
-    if (turn > from && turn < to) {
-        const double at = c[0] + turn * (c[1] + turn * c[2]);
-        r = (struct range){fmin(r.low, at), fmax(r.high, at)};
-    }
-    return r;
+    if (s->follows_bed && !s->config.formula)
+        straighten(gen, s, p);
 }
 
 static double fastest(const double c[3], double from, double to) {
-    return fmax(fabs(c[1] + 2 * c[2] * from), fabs(c[1] + 2 * c[2] * to));
+    return higher(fabs(c[1] + 2 * c[2] * from), fabs(c[1] + 2 * c[2] * to));
 }
 
-// Where a linear stepper over a bed turns at most once behind FROM: it cannot turn at all before its speed is
-// used up by the most that the bed's bends and its axes can change it.
+// How long a way of STEPS takes, at first at SPEED: not finite where it gets nowhere.
+static double time_of(double steps, double speed, double accel) {
+    return 2 * steps / (speed + sqrt(speed * speed + 2 * accel * steps));
+}
+
+// Where a linear stepper over a bed turns at most once behind BEGIN, or reaches no step (QUIET): it cannot
+// turn before its speed is used up by the most that the bed's bends and its axes can change it.
 static double bed_cut(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
-                      const struct moment *begin) {
+                      const struct moment *begin, bool *quiet) {
     const double from = begin->t, to = p->seconds, *weights = s->config.weights;
+    if (to <= from + SPAN_S)
+        return to;
     const struct range x = range_of(p->axis[AXIS_X], from, to), y = range_of(p->axis[AXIS_Y], from, to),
                        z = range_of(p->axis[AXIS_Z], from, to);
     if (!step_surface_is_smooth(&gen->surface, x.low, x.high, y.low, y.high, z.low, z.high))
@@ -228,105 +267,138 @@ static double bed_cut(const struct step_gen *gen, const struct stepper *s, const
                                                   2 * fabs(p->axis[AXIS_X][2]), 2 * fabs(p->axis[AXIS_Y][2]));
     for (int i = 0; i < AXES; i++)
         change += 2 * fabs(weights[i] * p->axis[i][2]);
-    return from + fmax(SPAN_S, fabs(begin->speed) * s->config.step_distance / change);
+    change /= s->config.step_distance;
+    const double speed = fabs(begin->speed), room = ROOM - fabs(begin->at - (double)s->position);
+    const double straight = fmax(SPAN_S, speed / change);
+    const double still = room > 0 ? time_of(room, speed, change) : 0;
+    *quiet = still > straight;
+    return from + fmax(straight, still);
 }
 
-// Whether a linear stepper over a bed reaches no step while its axes are no further than LOW to HIGH (mm)
-// from where it was last evaluated, and |slope there · way| is at most ALONG. Where the bed is smooth, that
-// slope says more than the steepest one.
-static bool stays_near(const struct step_gen *gen, const struct stepper *s, const double low[3],
-                       const double high[3], double along) {
-    const double *weights = s->config.weights, *known = s->known_at;
-    const double room = (0.5 - 2.0 / STEP_TIE - fabs(s->known_off)) * s->config.step_distance;
-    double far[3], straight = 0; // by the weights alone
-    for (int i = 0; i < 3; i++) {
-        far[i] = fmax(fabs(low[i]), fabs(high[i]));
-        straight += fabs(weights[i]) * far[i];
-    }
-    const double z = fabs(weights[AXIS_Z]);
-    if (straight + z * step_surface_change(&gen->surface, far) < room)
-        return true;
-    return far[AXIS_Z] < LEVEL_MM && straight + z * (along + step_surface_curl(&gen->surface, far)) < room &&
-           step_surface_is_smooth(&gen->surface, known[0] + low[0], known[0] + high[0], known[1] + low[1],
-                                  known[1] + high[1], known[2], known[2]);
-}
+// A linear stepper over a bed at a time.
+struct stand {
+    double at[3];    // X Y Z, mm
+    double slope[3]; // steps per mm of X, Y and Z
+    double off;      // steps from where its steps have it
+};
 
-// Whether it can reach no step in the piece: mostly.
-static bool reaches_nothing(const struct step_gen *gen, const struct stepper *s, const struct piece *p) {
-    if (s->config.formula || p->still || s->known_off == HUGE_VAL)
-        return false;
-    double low[3], high[3], along = 0, turned = 0;
-    for (int i = 0; i < 3; i++) {
-        const double gone = p->axis[i][0] - s->known_at[i];
-        const double way = fastest(p->axis[i], 0, p->seconds) * p->seconds;
-        low[i] = gone - way, high[i] = gone + way;
-        if (i < 2)
-            along += s->known_slope[i] * gone, turned += fabs(s->known_slope[i]) * way;
-    }
-    return stays_near(gen, s, low, high, fabs(along) + turned);
-}
-
-// Where the axes get from where a stepper was last evaluated, mm.
+// How far axes get from there, mm; or how fast they get, mm/s.
 struct box {
     double low[3], high[3];
 };
 
-static void extend(struct box *box, const double known[3], const double at[AXES]) {
+static void extend(struct box *box, int axis, double to) {
+    box->low[axis] = lower(box->low[axis], to);
+    box->high[axis] = higher(box->high[axis], to);
+}
+
+// What that changes by the slope alone, in steps (per s).
+static struct range sloped(const struct stand *stand, const struct box *box) {
+    struct range sum = {0, 0};
     for (int i = 0; i < 3; i++) {
-        box->low[i] = fmin(box->low[i], at[i] - known[i]);
-        box->high[i] = fmax(box->high[i], at[i] - known[i]);
+        const double one = stand->slope[i] * box->low[i], other = stand->slope[i] * box->high[i];
+        sum.low += lower(one, other), sum.high += higher(one, other);
     }
+    return sum;
 }
 
-static bool stays_in_box(const struct step_gen *gen, const struct stepper *s, const struct box *b) {
-    double least = 0, most = 0;
-    for (int i = 0; i < 2; i++) {
-        const double one = s->known_slope[i] * b->low[i], other = s->known_slope[i] * b->high[i];
-        least += fmin(one, other), most += fmax(one, other);
-    }
-    return stays_near(gen, s, b->low, b->high, fmax(fabs(least), fabs(most)));
+// Whether the bed is smooth wherever the axes may be in a box.
+static bool is_smooth(const struct step_gen *gen, const double at[3], const struct box *box) {
+    const bool level = higher(fabs(box->low[2]), fabs(box->high[2])) < LEVEL_MM;
+    return step_surface_is_smooth(&gen->surface, at[0] + box->low[0], at[0] + box->high[0],
+                                  at[1] + box->low[1], at[1] + box->high[1],
+                                  at[2] + (level ? 0 : box->low[2]), at[2] + (level ? 0 : box->high[2]));
 }
 
-// Passes whole moves on which a linear stepper over a bed reaches no step: what it sees of them through
-// shapers lies between places of the axes. Where that gets it no further, not before the move is over.
-static void pass_moves(const struct step_gen *gen, struct stepper *s, double until) {
-    if (!s->between || s->known_off == HUGE_VAL || s->time < s->stay)
-        return;
+// Whether the stepper reaches no step while its axes stay in a box. Where the bed is smooth, its slope there
+// says more than the steepest one.
+static bool stays_in(const struct step_gen *gen, const struct stepper *s, const struct stand *stand,
+                     const struct box *box) {
+    const double *weights = s->config.weights, off = stand->off;
+    const double mm = s->config.step_distance, z = fabs(weights[AXIS_Z]) / mm;
+    const struct range slope = sloped(stand, box);
+    double far[3], straight = 0; // by the weights alone
+    for (int i = 0; i < 3; i++) {
+        far[i] = higher(fabs(box->low[i]), fabs(box->high[i]));
+        straight += fabs(weights[i]) * far[i] / mm;
+    }
+    const double curl = z * step_surface_curl(&gen->surface, far);
+    if (off + slope.high + curl < ROOM && off + slope.low - curl > -ROOM && is_smooth(gen, stand->at, box))
+        return true;
+    return straight + z * step_surface_change(&gen->surface, far) < ROOM - fabs(off);
+}
+
+// The time before it reaches a step over a smooth bed at any of SPEEDS.
+static double time_left(const struct step_gen *gen, const struct stepper *s, const struct stand *stand,
+                        const struct box *speeds) {
+    const double z = fabs(s->config.weights[AXIS_Z]) / s->config.step_distance;
+    const struct range rate = sloped(stand, speeds);
+    double fast[3];
+    for (int i = 0; i < 3; i++)
+        fast[i] = higher(fabs(speeds->low[i]), fabs(speeds->high[i]));
+    const double accel = 2 * z * step_surface_curl(&gen->surface, fast); // curl is of ½·t²
+    return lower(time_of(ROOM - stand->off, rate.high, accel), time_of(ROOM + stand->off, -rate.low, accel));
+}
+
+static struct box in_time(const struct box *places, const struct box *speeds, double seconds) {
+    struct box box;
+    for (int i = 0; i < 3; i++) {
+        box.low[i] = higher(places->low[i], seconds * speeds->low[i]);
+        box.high[i] = lower(places->high[i], seconds * speeds->high[i]);
+    }
+    return box;
+}
+
+// Up to when it reaches no step, at least: there may be many pieces between two of its steps. Through shapers
+// it sees each axis between its places in the moves around that time, and at a speed between theirs.
+static double rests_until(const struct step_gen *gen, struct stepper *s, const struct stand *stand,
+                          double until) {
+    const double now = s->time;
     uint64_t n = s->passed < gen->kept_from ? gen->kept_from : s->passed;
-    while (n < gen->moves_to && is_over(move_end(step_move(gen, n)), s->time - s->lag))
+    while (n < gen->moves_to && is_over(move_end(step_move(gen, n)), now - s->lag))
         n++;
     s->passed = n;
     if (n == gen->moves_to)
-        return;
-    struct box box = {.low = {HUGE_VAL, HUGE_VAL, HUGE_VAL}, .high = {-HUGE_VAL, -HUGE_VAL, -HUGE_VAL}};
-    double at[AXES], end = s->time;
-    if (n > gen->kept_from)
-        step_move_end_position(step_move(gen, n - 1), at);
-    extend(&box, s->known_at, n > gen->kept_from ? at : gen->rest);
+        return now;
+    double end = now;
+    struct box places, speeds = {{0, 0, 0}, {0, 0, 0}}; // it may rest between moves
+    for (int i = 0; i < 3; i++)
+        places.low[i] = places.high[i] = step_move(gen, n)->start[i] - stand->at[i];
     for (; n < gen->moves_to && end < until; n++) {
         const struct trapezoid *m = step_move(gen, n);
+        double at[AXES];
         step_move_end_position(m, at);
-        extend(&box, s->known_at, m->start);
-        extend(&box, s->known_at, at);
-        if (!stays_in_box(gen, s, &box))
+        for (int i = 0; i < 3; i++) {
+            extend(&places, i, at[i] - stand->at[i]);
+            extend(&speeds, i, m->ratio[i] * m->cruise_v);
+        }
+        const double over =
+            (n + 1 < gen->moves_to ? step_move(gen, n + 1)->print_time : move_end(m)) - s->reach;
+        if (over <= now)
+            continue;
+        struct box box = in_time(&places, &speeds, over - now);
+        if (!stays_in(gen, s, stand, &box)) {
+            const double seconds = lower(over - now, SURE * time_left(gen, s, stand, &speeds));
+            box = in_time(&places, &speeds, seconds);
+            if (is_smooth(gen, stand->at, &box))
+                end = higher(end, now + seconds);
             break;
-        end = (n + 1 < gen->moves_to ? step_move(gen, n + 1)->print_time : move_end(m)) - s->reach;
+        }
+        end = over;
     }
-    if (end > s->time)
-        s->time = fmin(end, until), s->checked = -1;
-    else
-        s->stay = move_end(step_move(gen, s->passed)) + s->lag;
+    return lower(end, until);
 }
 
-// The first time after BEGIN behind which the stepper's speed may behave otherwise.
+// The first time after BEGIN behind which the stepper's speed may behave otherwise; QUIET: no step comes
+// before.
 static double next_cut(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
-                       const struct moment *begin) {
+                       const struct moment *begin, bool *quiet) {
     const double *c = p->poly, from = begin->t;
     double cut = p->seconds;
     if (p->still)
         return cut;
     if (!p->linear)
-        return fmin(cut, s->config.formula ? from + SPAN_S : bed_cut(gen, s, p, begin));
+        return fmin(cut, s->config.formula ? from + SPAN_S : bed_cut(gen, s, p, begin, quiet));
     if (!p->smooth) {
         const double turn = -c[1] / (2 * c[2]); // not finite in a cruise
         return turn > from + EXACT_S && turn < cut ? turn : cut;
@@ -363,23 +435,27 @@ static struct moment find_turn(const struct step_gen *gen, const struct stepper 
     return inside ? moment_at(gen, s, p, high) : last;
 }
 
-// The time in FROM..TO at which the stepper, moving in DIRECTION, is at BOUNDARY; GUESS is any time.
+// The time in FROM..TO at which the stepper, moving in DIRECTION, is at BOUNDARY. GUESS: any time; SPEED:
+// then that in DIRECTION.
 static double solve(const struct step_gen *gen, const struct stepper *s, const struct piece *p, double from,
-                    double to, double guess, int direction, double boundary) {
+                    double to, double guess, int direction, double boundary, double *speed) {
     double low = from, high = to, t = guess > low && guess < high ? guess : low;
+    *speed = 0;
     for (int i = 0; i < ITERATIONS && high - low > EXACT_S; i++) {
-        double speed;
-        const double off = (evaluate(gen, s, p, t, &speed) - boundary) * direction;
+        const double off = (evaluate(gen, s, p, t, speed) - boundary) * direction;
+        *speed *= direction;
         if (off > 0)
             high = t;
         else
             low = t;
-        double next = t - off / (speed * direction);
-        if (!(next >= low && next <= high))
-            next = 0.5 * (low + high);
+        const double next = t - off / *speed;
+        if (!(next >= low && next <= high)) {
+            t = 0.5 * (low + high);
+            continue;
+        }
         const double change = fabs(next - t);
         t = next;
-        if (change < EXACT_S)
+        if (change < CLOSE_S)
             break;
     }
     return t;
@@ -421,32 +497,47 @@ static bool solve_block(const double c[5], double low, double high, double first
     return good;
 }
 
+// In which the stepper does not turn: times from the piece's begin, places in steps, speeds.
+struct span {
+    double from, to, begin, end, v0, v1;
+    int direction;
+    int64_t target;
+};
+
+// The times of COUNT steps of a span from the one over boundary FIRST on, which come behind FROM; GUESS: of
+// the first, and then of the next.
 static void solve_one_by_one(const struct step_gen *gen, const struct stepper *s, const struct piece *p,
-                             double from, double to, int direction, int64_t position, int count, double *t) {
-    double last = from, guess = from;
+                             const struct span *of, double from, double first, int count, double *guess,
+                             double *t) {
+    const double accel = (of->v1 - of->v0) / (of->to - of->from);
+    double speed;
     for (int i = 0; i < count; i++) {
-        const double boundary = (double)(position + (int64_t)i * direction) + 0.5 * direction;
-        t[i] = solve(gen, s, p, last, to, guess, direction, boundary);
-        guess = t[i] + (t[i] - last);
-        last = t[i];
+        t[i] = solve(gen, s, p, i ? t[i - 1] : from, of->to, *guess, of->direction,
+                     first + (double)i * of->direction, &speed);
+        *guess = t[i] + time_of(1, speed, accel);
     }
 }
 
-static int play_solved(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to,
-                       int direction, int64_t target) {
-    double t[SOLVED + FILL_BLOCK], c[5];
+static int play_solved(struct step_gen *gen, struct stepper *s, const struct piece *p,
+                       const struct span *of) {
+    double t[SOLVED + FILL_BLOCK], c[5], from = of->from;
+    const int direction = of->direction;
     const struct phase flow = {.time = p->begin, .seconds = p->seconds, .solved = t};
+    double guess = from; // a parabola's
+    guess += time_of(fabs((double)s->position + 0.5 * direction - of->begin), of->v0,
+                     (of->v1 - of->v0) / (of->to - from));
     for (int k = 0; k < 5; k++)
         c[k] = p->poly[k] * direction;
-    while (s->position != target) {
-        const int64_t left = (target - s->position) * direction;
+    while (s->position != of->target) {
+        const int64_t left = (of->target - s->position) * direction;
         const int count = left < SOLVED ? (int)left : SOLVED;
         memset(t + count, 0, FILL_BLOCK * sizeof(*t)); // is read, and does not matter
         for (int i = 0; i < count; i += FILL_BLOCK) {
             const int n = count - i < FILL_BLOCK ? count - i : FILL_BLOCK;
             const int64_t position = s->position + (int64_t)i * direction;
-            if (!p->linear || !solve_block(c, from, to, (double)(position * direction) + 0.5, n, t + i))
-                solve_one_by_one(gen, s, p, from, to, direction, position, n, t + i);
+            const double first = (double)position + 0.5 * direction;
+            if (!p->linear || !solve_block(c, from, of->to, first * direction, n, t + i))
+                solve_one_by_one(gen, s, p, of, from, first, n, &guess, t + i);
             from = t[i + n - 1];
         }
         const int status = step_put(gen, s, &flow, direction, 0, 1, count);
@@ -456,16 +547,9 @@ static int play_solved(struct step_gen *gen, struct stepper *s, const struct pie
     return STEP_OK;
 }
 
-// In which the stepper does not turn: times from the piece's begin, places in steps, speeds.
-struct span {
-    double from, to, begin, end, v0, v1;
-    int direction;
-    int64_t target;
-};
-
 static int put_span(struct step_gen *gen, struct stepper *s, const struct piece *p, const struct span *of) {
     if (!p->linear || p->smooth)
-        return play_solved(gen, s, p, of->from, of->to, of->direction, of->target);
+        return play_solved(gen, s, p, of);
     struct phase span = {.time = p->begin + of->from, .seconds = of->to - of->from};
     span.way = fabs(of->end - of->begin);
     span.backwards = of->v1 < of->v0;
@@ -495,7 +579,8 @@ static void note_tie(const struct step_gen *gen, struct stepper *s, const struct
     const double boundary = (double)s->position + 0.5 * direction;
     const bool beyond = end != begin && (end - boundary) * direction > 0;
     if (beyond && (begin - boundary) * direction <= 0) {
-        s->crossed = p->begin + solve(gen, s, p, from, to, from, direction, boundary);
+        double speed;
+        s->crossed = p->begin + solve(gen, s, p, from, to, from, direction, boundary, &speed);
         s->crossed_direction = direction;
     } else if (!beyond || s->crossed_direction != direction) {
         s->crossed_direction = 0;
@@ -522,26 +607,40 @@ static int play_span(struct step_gen *gen, struct stepper *s, const struct piece
     return status;
 }
 
-static int play_piece(struct step_gen *gen, struct stepper *s, const struct piece *p) {
-    if (s->follows_bed && reaches_nothing(gen, s, p))
-        return STEP_OK;
+static struct stand stand_at(const struct stepper *s, const struct piece *p, const struct moment *begin) {
+    struct stand stand = {.off = begin->at - (double)s->position};
+    for (int i = 0; i < 3; i++) {
+        const double by_bed = i < 2 ? s->config.weights[AXIS_Z] * begin->slope[i] : 0;
+        stand.at[i] = p->axis[i][0];
+        stand.slope[i] = (s->config.weights[i] + by_bed) / s->config.step_distance;
+    }
+    return stand;
+}
+
+// Steps up to TIME are done.
+static int play_on(struct stepper *s, double time) {
+    s->time = time;
+    s->checked = -1;
+    return STEP_OK;
+}
+
+static int play_piece(struct step_gen *gen, struct stepper *s, const struct piece *p, double until) {
+    const double over = p->begin + p->seconds;
     struct moment from = moment_at(gen, s, p, 0);
     const double off = from.at - (double)s->position;
     if (s->time != s->checked && !(fabs(off) <= JUMP_STEPS))
         return step_fail(gen, STEP_JUMP, s, p->begin, off);
     s->checked = s->time;
-    if (s->follows_bed) {
-        for (int i = 0; i < 3; i++)
-            s->known_at[i] = p->axis[i][0];
-        s->known_slope[0] = from.slope[0], s->known_slope[1] = from.slope[1];
-        s->known_off = off;
-        if (reaches_nothing(gen, s, p))
-            return STEP_OK;
-        s->known_off = HUGE_VAL; // it steps on
+    if (!p->linear && !s->config.formula) {
+        const struct stand stand = stand_at(s, p, &from);
+        const double end = s->between ? rests_until(gen, s, &stand, until) : s->time;
+        if (end >= over)
+            return play_on(s, end);
     }
     while (from.t < p->seconds) {
-        const double end = next_cut(gen, s, p, &from);
-        const bool turns = !p->still && (!p->linear || p->smooth);
+        bool quiet = p->still;
+        const double end = next_cut(gen, s, p, &from, &quiet);
+        const bool turns = !quiet && (!p->linear || p->smooth);
         const struct moment to = turns ? find_turn(gen, s, p, &from, end) : moment_at(gen, s, p, end);
         const int status = play_span(gen, s, p, &from, &to);
         if (status)
@@ -551,23 +650,17 @@ static int play_piece(struct step_gen *gen, struct stepper *s, const struct piec
         from = to;
         s->time = s->checked = p->begin + to.t; // steps up to here are done, whatever comes
     }
-    return STEP_OK;
+    return play_on(s, over);
 }
 
 int step_curve_advance(struct step_gen *gen, struct stepper *s, double until) {
     s->crossed = fmax(s->crossed, s->time); // what is due before may be compressed
     while (s->time < until - ROUNDING_S) {
-        if (s->follows_bed)
-            pass_moves(gen, s, until);
-        if (!(s->time < until - ROUNDING_S))
-            break;
         struct piece piece;
         make_piece(gen, s, until, &piece);
-        const int status = play_piece(gen, s, &piece);
+        const int status = play_piece(gen, s, &piece, until);
         if (status)
             return status;
-        s->time = piece.begin + piece.seconds;
-        s->checked = -1;
     }
     return STEP_OK;
 }

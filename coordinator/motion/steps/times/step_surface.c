@@ -57,7 +57,7 @@ static int interval(double at, double from, double step, int points, double *sha
         return 0;
     }
     const int i = u < last ? (int)u : points - 2;
-    *share = fmin(u - i, 1);
+    *share = u - i < 1 ? u - i : 1;
     return i;
 }
 
