@@ -14,10 +14,10 @@ from coordinator.config.model import SECOND_CARRIAGE, MachineDescription, RailDe
 from coordinator.kinematics.base import Point
 from coordinator.kinematics.delta import Delta
 from coordinator.virtual_machine.plant_bed import BedSettings, ProbeParts, load_cells, probe_parts
-from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
+from coordinator.virtual_machine.plant_heat import BED_BODY, HeatSettings, NodeHeat, machine_heat
 from coordinator.virtual_machine.plant_tmc import machine_drivers
 from nodes.support.errors import CanductorError
-from nodes.virtual.plant import Axis, Coil, LoadCell, NodePlant, Stepper, Switch, Term
+from nodes.virtual.plant import Axis, Bed, Coil, LoadCell, NodePlant, Stepper, Switch, Term
 
 AXES: Final = "xyz"
 START_MM: Final = 30.0
@@ -69,10 +69,11 @@ def machine_plants(
     ]
     probe = _probe(description, start, rails, settings)
     plants = [_mechanics(description, node.name, endstops, settings) for node in description.nodes]
+    heat = machine_heat(description, settings.heat)
     if probe is not None:
+        probe = replace(probe, bed=_warmed(probe.bed, heat))
         plants = [_with_probe(plant, probe) for plant in plants]
     scales = load_cells(description, settings.bed)
-    heat = machine_heat(description, settings.heat)
     drivers = machine_drivers(description)
     return {
         plant.node: replace(
@@ -172,6 +173,16 @@ def _with_probe(plant: NodePlant, parts: ProbeParts) -> NodePlant:
     if isinstance(parts.probe, LoadCell):
         return replace(plant, axes=axes, beds=(parts.bed,), load_cells=(parts.probe,))
     return replace(plant, axes=axes, beds=(parts.bed,), probes=(parts.probe,), deltas=parts.deltas)
+
+
+def _warmed(bed: Bed, heat: Mapping[str, NodeHeat]) -> Bed:
+    """Return the bed with what warms it, where that bends it: the body of [heater_bed]."""
+    if not bed.warm_bow or bed.body is not None:
+        return bed
+    for node, of_node in heat.items():
+        if any(body.name == BED_BODY for body in of_node.bodies):
+            return replace(bed, node=node, body=BED_BODY)
+    raise CanductorError("the bed of the plant has a warm_bow, but nothing warms it; add [heater_bed]")
 
 
 def _stepper(stepper: StepperDescription, settings: PlantSettings) -> Stepper:

@@ -178,6 +178,9 @@ static void look_at_peers(struct plant *plant, uint64_t ns) {
         sensor->remote = remote;
         plant->zones[sensor->zone].stale = 1;
     }
+    for (int i = 0; i < plant->bed_count; i++)
+        if (plant->beds[i].body.name[0] && plant->beds[i].body.peer >= 0)
+            plant->beds[i].remote = peer_value(plant, &plant->beds[i].body, PLANT_BODY, plant->ambient);
 }
 
 // Brings heat to NS. While it asks others, who may ask back, it has what it had.
@@ -233,6 +236,8 @@ int plant_input(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
     int any_pressed = 0, inverted = -1;
     for (int i = 0; i < plant->switch_count; i++)
         if (plant->switches[i].pin == (int)pin) { // several may be wired to one pin: any of them does it
+            if (plant->switches[i].bed >= 0 && plant->beds[plant->switches[i].bed].body.name[0])
+                refresh(plant, ns);
             any_pressed |= plant_switch_pressed(plant, &plant->switches[i], ns);
             inverted = plant->switches[i].inverted != 0;
         }

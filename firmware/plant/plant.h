@@ -90,6 +90,8 @@ struct plant_delta {
 struct plant_bed {
     char name[PLANT_NAME];
     double z, x0, y0, tilt_x, tilt_y, bow, radius;
+    struct plant_reference body; // which warms it; without a name none does
+    double warm_bow, remote;     // mm per K above the ambient; of a body of another node, °C
 };
 
 // What moves the pin of a BLTouch: a servo's signal, whose pulses are commands by their lengths. Two equal
@@ -350,6 +352,7 @@ int plant_diag_level(struct plant *plant, struct plant_diag *diag, uint64_t ns);
 int plant_heat_make(struct plant *plant, char *error);
 void plant_heat_advance(struct plant *plant, uint64_t ns);
 void plant_heat_changed(struct plant *plant, int body); // after its heaters' or fans' duty has changed
+double plant_body_temperature(const struct plant *plant, int body);
 double plant_sensor_temperature(const struct plant *plant, const struct plant_sensor *sensor);
 // plant_sensor.c
 double plant_sensor_ratio(const struct plant_sensor *sensor, double temperature);

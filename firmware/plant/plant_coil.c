@@ -68,11 +68,7 @@ static uint64_t made(const struct plant *plant, const struct plant_coil *coil, u
 
 static double frequency(struct plant *plant, struct plant_coil *coil, uint64_t ns) {
     double height = -plant_probe_depth_at(plant, &coil->place, ns);
-    double celsius = plant->ambient;
-    if (coil->body >= 0) {
-        const struct plant_body *body = &plant->bodies[coil->body];
-        celsius = plant->zones[body->zone].x[body->state];
-    }
+    double celsius = coil->body < 0 ? plant->ambient : plant_body_temperature(plant, coil->body);
     double warmth = 1 + coil->drift * (celsius - 25);
     return coil->far * (1 + coil->gain * exp(-fmax(height, 0) / coil->reach)) * warmth;
 }

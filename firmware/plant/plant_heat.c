@@ -167,6 +167,10 @@ void plant_heat_changed(struct plant *plant, int body) {
     plant->zones[plant->bodies[body].zone].stale = 1;
 }
 
+double plant_body_temperature(const struct plant *plant, int body) {
+    return plant->zones[plant->bodies[body].zone].x[plant->bodies[body].state];
+}
+
 double plant_sensor_temperature(const struct plant *plant, const struct plant_sensor *sensor) {
     if (sensor->lag > 0)
         return plant->zones[sensor->zone].x[sensor->state];
@@ -174,8 +178,7 @@ double plant_sensor_temperature(const struct plant *plant, const struct plant_se
         return plant->ambient;
     if (sensor->body.peer >= 0)
         return sensor->remote;
-    const struct plant_body *body = &plant->bodies[sensor->body.found];
-    return plant->zones[body->zone].x[body->state];
+    return plant_body_temperature(plant, sensor->body.found);
 }
 
 // ------------------------------------------------------------------------------------------ being made

@@ -104,11 +104,16 @@ static void set_pressed(struct plant *plant, struct plant_switch *it, int presse
     plant_note(plant, ns, "switch", it->name, pressed);
 }
 
-static double bed_height(const struct plant_bed *bed, double x, double y) {
+static double bed_height(const struct plant *plant, const struct plant_bed *bed, double x, double y) {
     double dx = x - bed->x0;
     double dy = y - bed->y0;
     double far = (dx * dx + dy * dy) / (bed->radius * bed->radius);
-    return bed->z + bed->tilt_x * dx + bed->tilt_y * dy + bed->bow * (1 - far);
+    double bow = bed->bow;
+    if (bed->body.name[0]) {
+        double celsius = bed->body.peer < 0 ? plant_body_temperature(plant, bed->body.found) : bed->remote;
+        bow += bed->warm_bow * (celsius - plant->ambient);
+    }
+    return bed->z + bed->tilt_x * dx + bed->tilt_y * dy + bow * (1 - far);
 }
 
 // The place of an axis whose steps are all in at NS; 0 where there is none.
@@ -152,7 +157,7 @@ static double probe_depth(struct plant *plant, const struct plant_switch *it, ui
         nozzle[2] + x * position(plant, it->slope_x_axis, ns) + y * position(plant, it->slope_y_axis, ns);
     const struct plant_bed *bed = &plant->beds[it->bed];
     double lean = it->lean_x * (x - bed->x0) + it->lean_y * (y - bed->y0);
-    return bed_height(bed, x, y) + it->offset_z + lean - z;
+    return bed_height(plant, bed, x, y) + it->offset_z + lean - z;
 }
 
 // How far the bed has pushed a probe in.

@@ -134,13 +134,20 @@ static int read_bed(const struct plant_reader *reader, char *rest) {
         {"tilt_y", NUMBER, AT(plant_bed, tilt_y), -1, 1, 1},
         {"bow", NUMBER, AT(plant_bed, bow), -100, 100, 1},
         {"radius", NUMBER, AT(plant_bed, radius), 1, 1e6, 1},
+        {"node", NAME, AT(plant_bed, body.node), 0, 0, 1},
+        {"body", NAME, AT(plant_bed, body.name), 0, 0, 1},
+        {"warm_bow", NUMBER, AT(plant_bed, warm_bow), -1, 1, 1},
     };
     struct plant *plant = reader->plant;
     if (plant->bed_count == PLANT_BEDS)
         return plant_text_fail(reader, "bed", "too many");
     struct plant_bed *bed = &plant->beds[plant->bed_count];
     bed->radius = 100;
+    bed->remote = plant->ambient;
+    bed->body.node[0] = '-';
     if (plant_text_fields(reader, FIELDS(fields), rest, bed))
+        return -1;
+    if (bed->body.name[0] && resolve(reader, &bed->body, plant_text_body))
         return -1;
     plant->bed_count++;
     return 0;

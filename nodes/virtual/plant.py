@@ -92,6 +92,11 @@ class Bed:
     bow: float = 0.0
     """How much higher its middle is than a circle of ``radius`` around it."""
     radius: float = 100.0
+    node: str | None = None
+    """Of the body that warms it."""
+    body: str | None = None
+    warm_bow: float = 0.0
+    """mm that ``bow`` grows per K by which that body is warmer than the ambient."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -417,6 +422,7 @@ class NodePlant:
         named += [cooling.node for cooling in self.coolings]
         named += [sensor.node for sensor in self.sensors]
         named += [diag.node for diag in self.diags]
+        named += [bed.node for bed in self.beds if bed.node is not None]
         return tuple(dict.fromkeys(name for name in named if name != self.node))
 
     def _lines(self) -> Iterator[str]:
@@ -428,9 +434,9 @@ class NodePlant:
                 fields = {"axis": axis.name, "node": self._short(term.node), "stepper": term.stepper}
                 yield _line("term", fields | {"mm": term.mm_per_step})
         for kind, parts in (
-            *(("switch", self.switches), ("bed", self.beds), ("delta", self.deltas)),
-            *(("probe", self.probes), ("tmc", self.tmcs)),
-            *(("diag", self.diags), ("body", self.bodies), ("couple", self.couples), ("fan", self.fans)),
+            *(("switch", self.switches), ("body", self.bodies), ("bed", self.beds)),
+            *(("delta", self.deltas), ("probe", self.probes), ("tmc", self.tmcs)),
+            *(("diag", self.diags), ("couple", self.couples), ("fan", self.fans)),
             *(("cooling", self.coolings), ("heater", self.heaters), ("coil", self.coils)),
             ("load_cell", self.load_cells),
         ):
@@ -446,7 +452,7 @@ class NodePlant:
             yield _line(kind, self._own(_fields(part)))
 
     def _own(self, fields: dict[str, Any]) -> dict[str, Any]:
-        return fields | {"node": self._short(fields["node"])} if "node" in fields else fields
+        return fields | {"node": self._short(fields["node"])} if fields.get("node") else fields
 
     def _short(self, node: str) -> str:
         return "-" if node == self.node else node

@@ -1,6 +1,7 @@
 """[bed_mesh] on a virtual bed in virtual time: what is probed and where the nozzle goes, by its formula."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from coordinator.virtual_machine.plant_bed import BedSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.virtual.plant import Bed
 from tests.stages.printer_text import section
 from tests.stages.probe_stage import MICROSTEP_MM, OFFSET, START, ProbeStage, bed_height, machine_text
@@ -18,6 +20,15 @@ MESH: dict[str, object] = {
     "mesh_max": "180, 170",
     "probe_count": "4, 3",
     "speed": 200,
+}
+HEATER: dict[str, object] = {
+    "heater_pin": "PC8",
+    "sensor_type": "Generic 3950",
+    "sensor_pin": "PA3",
+    "control": "watermark",
+    "max_delta": 0.2,
+    "min_temp": 0,
+    "max_temp": 120,
 }
 
 
@@ -73,6 +84,29 @@ def test_the_nozzle_follows_the_bed(tmp_path: Path, algorithm: str, counts: str)
     assert heights == pytest.approx(np.array(exact), abs=0.005)
     assert len(gaps) > 300
     assert gaps == pytest.approx([0.3] * len(gaps), abs=0.010)
+
+
+def test_the_mesh_of_a_warm_bed_is_its_own(tmp_path: Path) -> None:
+    """The bed bows as it gets warm: its heater is on another node than the probe."""
+    warm = replace(BOWED.shape, warm_bow=0.004)
+    heater = section("heater_bed", **HEATER)
+    text = machine_text(sections=section("bed_mesh", **MESH) + heater)
+    stage = ProbeStage(tmp_path, text, bed=replace(BOWED, shape=warm), heat=HeatSettings(hurry=3.0))
+    measure = ("G28", "G1 Z5 F900", "BED_MESH_CALIBRATE", "BED_MESH_MAP")
+    cold, hot = (
+        np.array(json.loads(text.removeprefix("mesh_map_output"))["z_positions"])
+        for text in stage.do(*measure, "G1 X0 Y0 F6000", "M190 S60", *measure)
+        if text.startswith("mesh_map_output")
+    )
+    exact = [[truth(x, y) for x in np.linspace(30, 180, 4)] for y in np.linspace(30, 170, 3)]
+    assert cold == pytest.approx(np.array(exact), abs=0.005)
+    bowed = replace(BOWED.shape, bow=BOWED.shape.bow + 0.004 * (60 - 25))
+    bent = [
+        [bed_height(bowed, x, y) - bed_height(bowed, 20, 10) for x in np.linspace(30, 180, 4)]
+        for y in np.linspace(30, 170, 3)
+    ]
+    assert hot == pytest.approx(np.array(bent), abs=0.01)
+    assert np.ptp(hot - cold) > 0.05
 
 
 def test_without_a_mesh_the_nozzle_does_not(tmp_path: Path) -> None:

@@ -172,6 +172,19 @@ static void test_a_bed_presses_the_probe(void) {
     free(rig);
 }
 
+// The same bow of 0.2 mm, and 0.005 mm for each of the 20 K by which the body is warmer than the ambient.
+static void test_a_warm_bed_bows(void) {
+    struct rig *rig = new_rig("plant node=n\n"
+                              "axis name=x origin=60\n"
+                              "axis name=z origin=2\n"
+                              "body name=plate capacity=1 loss=0 start=45\n"
+                              "bed name=bed x0=50 bow=0.2 radius=100 body=plate warm_bow=0.005\n"
+                              "probe name=p pin=PB0 bed=bed x=x y=x z=z offset_y=-60\n");
+    double depth = plant_probe_depth(&rig->plant, &rig->plant.switches[0], 0);
+    CHECK(fabs(depth - (0.3 * (1 - 0.01) - 2)) < 1e-9);
+    free(rig);
+}
+
 // A delta whose rods and towers are all different; a step of one joint moves its nozzle sideways, too.
 static void test_rods_hold_the_nozzle_of_a_delta(void) {
     struct rig *rig = new_rig("plant node=n\n"
@@ -325,6 +338,7 @@ int main(void) {
     test_a_switch_with_travel_and_stops();
     test_two_switches_on_one_pin();
     test_a_bed_presses_the_probe();
+    test_a_warm_bed_bows();
     test_rods_hold_the_nozzle_of_a_delta();
     test_noise_moves_the_switch_between_approaches();
     test_an_axis_of_two_other_nodes();
