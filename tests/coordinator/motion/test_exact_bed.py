@@ -16,8 +16,9 @@ from coordinator.motion.steps.surface import Surface
 from coordinator.verification.exact_bed import ExactBed
 from coordinator.verification.exact_path import Setting
 from tests.coordinator.motion.bed_cases import WITH_Z, SomeBed, across, bed, judge, over_bed, z_spec
-from tests.coordinator.motion.exact_cases import AWAY, SETTING, spec_of
+from tests.coordinator.motion.exact_cases import AWAY, SETTING, spec_of, trapezoids
 from tests.coordinator.motion.steps_harness import node_spec, stepper
+from tests.coordinator.motion.steps_oracle import make_move
 from tests.profiles import examples
 
 SETTINGS = {"plain": Setting(), "shaped": SETTING}
@@ -57,6 +58,21 @@ def test_long_moves_over_many_patches(seed: int) -> None:
     surface = bed(seed, spacing_mm=7.0)
     fine = Surface(surface.origin_mm, (7.0 / 3, 5.6 / 3), np.tile(surface.nodes / 3, (3, 3, 1)))
     assert judge(spec, across(seed), Setting(), fine) > 5000
+
+
+def test_moves_from_the_edge() -> None:
+    """They come back to it by a rounding error too far: beyond it the bed is level, in front of it not."""
+    rng = np.random.default_rng(1)
+    beyond = (float(np.nextafter(AWAY[0], 0)), float(np.nextafter(AWAY[1], 0)), *AWAY[2:])
+    nodes = np.zeros((2, 2, 4))
+    nodes[:, 1, 0], nodes[:, :, 1] = 0.4, 0.02
+    spec, moves, t = z_spec("z", 0.0025), [], 1.0
+    for _ in range(40):
+        far = (AWAY[0] + rng.uniform(1, 15), AWAY[1] + rng.uniform(1, 15), AWAY[2], 0.0)
+        for begin, end in ((AWAY, far), (far, beyond)):
+            moves.append(make_move(t, begin, end, (0.0, 150.0, 0.0), 8000.0))
+            t += moves[-1].total_s + rng.choice([0.0, 0.3])
+    assert judge(spec, trapezoids(moves), Setting(), Surface(AWAY[:2], (20.0, 20.0), nodes)) > 500
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -361,9 +361,9 @@ static double rests_until(const struct step_gen *gen, struct stepper *s, const s
     if (n == gen->moves_to)
         return now;
     double end = now;
-    struct box places, speeds = {{0, 0, 0}, {0, 0, 0}}; // it may rest between moves
+    struct box places = {{0, 0, 0}, {0, 0, 0}}, speeds = {{0, 0, 0}, {0, 0, 0}}; // it may rest between moves
     for (int i = 0; i < 3; i++)
-        places.low[i] = places.high[i] = step_move(gen, n)->start[i] - stand->at[i];
+        extend(&places, i, step_move(gen, n)->start[i] - stand->at[i]);
     for (; n < gen->moves_to && end < until; n++) {
         const struct trapezoid *m = step_move(gen, n);
         double at[AXES];
