@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import functools
 import socket
 import ssl
 from collections.abc import Callable, Mapping
@@ -23,6 +24,7 @@ from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.stop_lane import FindStop, StopLane
 from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, TcpListener
+from coordinator.ipc.server.tls_transport import TlsTransport
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
@@ -76,6 +78,7 @@ class IpcServer:
         """Connections that count against ``tcp_connections_max``."""
         self._stop_lane = stop_lane
         self._watch: asyncio.Task[None] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._scheduler: FairScheduler | None = None
         self._sessions = 0
         self._refused = 0
@@ -91,6 +94,7 @@ class IpcServer:
     async def start(self) -> None:
         """Open the sockets; raises CanductorError with all closed."""
         scheduler = self._scheduler = FairScheduler()
+        self._loop = asyncio.get_running_loop()
         try:
             if self._settings.tokens is not None:
                 self._tokens = await asyncio.to_thread(Tokens.read, self._settings.tokens)
@@ -176,6 +180,8 @@ class IpcServer:
             context,
             handshakes_max=min(HANDSHAKES_MAX, most),
             may_enter=lambda entering: entering + len(self._tcp) < most + REFUSALS_MAX,
+            stop_lane=self._stop_lane,
+            find_stop=self._find_stop_over_tcp,
         )
         try:
             await listener.open(tcp.host, tcp.port)
@@ -189,11 +195,13 @@ class IpcServer:
     def watch_stops(
         self, connection: Connection, transport: asyncio.BaseTransport | None, find_stop: FindStop
     ) -> None:
-        """Look for stops of CONNECTION in what TRANSPORT has unread, while the loop is held; not with TLS."""
+        """Look for stops of CONNECTION in what TRANSPORT has unread, while the loop is held."""
         opened = None if transport is None else transport.get_extra_info("socket")
         if self._stop_lane is None or transport is None or opened is None:
             return
-        if transport.get_extra_info("sslcontext") is None:
+        if isinstance(transport, TlsTransport):
+            self._stop_lane.watch_with(connection, functools.partial(transport.find_in, find_stop))
+        else:
             self._stop_lane.watch(connection, opened, find_stop)
 
     # ----------------------------------------------------------------------------------------- tokens
@@ -293,7 +301,12 @@ class IpcServer:
 
     def _admit_tcp(self, transport: asyncio.Transport, connection: Connection) -> Session:
         address = str((transport.get_extra_info("peername") or ("unknown",))[0])
-        session = self._session(connection, address, self._token_check(connection, address))
+        session = self._session(
+            connection,
+            address,
+            self._token_check(connection, address),
+            functools.partial(self._find_token, address),
+        )
         wait_s = self._lockout_s(address)
         if len(self._tcp) >= self._settings.tcp_connections_max:
             self._refuse(session, EndReason("busy", "there are too many connections over TCP; close others"))
@@ -312,6 +325,19 @@ class IpcServer:
         )
         return session.find_stop(unread)
 
+    def _find_stop_over_tcp(self, address: str, unread: bytes) -> str | None:
+        """Return who stops the machine with the UNREAD bytes of a new connection over TCP from ADDRESS."""
+        find = functools.partial(self._find_token, address)
+        session = Session(self._context, 0.0, number=0, peer=address, granted=None, find_token=find)
+        return session.find_stop(unread)
+
+    def _find_token(self, address: str, token: str) -> Grant | None:
+        """Return what TOKEN gives to somebody at ADDRESS, in any thread: the loop counts when it reads it."""
+        tokens, loop = self._tokens, self._loop
+        if tokens is None or loop is None or self._throttle.lockout_s(address, loop.time()) > 0:
+            return None
+        return tokens.check(token)
+
     def _token_check(self, connection: Connection, address: str) -> Callable[[str], Grant | None]:
         """Return what looks at the token of CONNECTION's hello; failures count for ADDRESS, if it has one."""
 
@@ -323,11 +349,23 @@ class IpcServer:
 
         return check
 
-    def _session(self, connection: Connection, peer: str, check: Callable[[str], Grant | None]) -> Session:
+    def _session(
+        self,
+        connection: Connection,
+        peer: str,
+        check: Callable[[str], Grant | None],
+        find_token: Callable[[str], Grant | None] | None = None,
+    ) -> Session:
         self._sessions += 1
         now_s = asyncio.get_running_loop().time()
         session = Session(
-            self._context, now_s, number=self._sessions, peer=peer, granted=None, check_token=check
+            self._context,
+            now_s,
+            number=self._sessions,
+            peer=peer,
+            granted=None,
+            check_token=check,
+            find_token=find_token,
         )
         self._connections.add(connection)
         self.watch_stops(connection, connection.transport, session.find_stop)

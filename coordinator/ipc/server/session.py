@@ -70,7 +70,8 @@ class SessionContext:
 class Session:
     """One client. PEER names it for people; GRANTED is what it may do without a token.
 
-    CHECK_TOKEN is None where there are no tokens. Times are seconds of one clock.
+    CHECK_TOKEN is None where there are no tokens; FIND_TOKEN does the same in any thread, and counts nothing.
+    Times are seconds of one clock.
     """
 
     def __init__(
@@ -82,12 +83,14 @@ class Session:
         peer: str,
         granted: Scope | None,
         check_token: Callable[[str], Grant | None] | None = None,
+        find_token: Callable[[str], Grant | None] | None = None,
     ) -> None:
         self.context = context
         self.number = number
         self.peer = peer
         self.granted = granted
         self.check_token = check_token
+        self._find_token = find_token
         self.caller: Caller | None = None
         """None until the hello."""
         self.end_reason: EndReason | None = None
@@ -217,6 +220,7 @@ class Session:
         if self.end_reason is not None or not (unread or self._reader.waiting_bytes or self._waiting):
             return None
         twin = Session(self.context, 0.0, number=self.number, peer=self.peer, granted=self.granted)
+        twin.check_token = self._find_token
         twin.caller, twin._reader = self.caller, self._reader.copy()
         twin._reader.feed(unread, 0.0)
         waiting = tuple(self._waiting)

@@ -25,13 +25,20 @@ ACCEPTED_MAX: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
+class Arrival:
+    """A connection that was accepted during a hold."""
+
+    find: Finder
+    serve: Callable[[], None]
+    """Let the loop serve it; called on the loop."""
+    close: Callable[[], None]
+
+
+@dataclass(frozen=True, slots=True)
 class _Listener:
     listening: socket.socket
     loop: asyncio.AbstractEventLoop
-    make: Callable[[], asyncio.BaseProtocol]
-    """Makes the protocol of a connection."""
-    find_stop: Callable[[socket.socket, bytes], str | None]
-    """For a connection that nobody has read from."""
+    arrive: Callable[[socket.socket], Arrival]
 
 
 class StopLane:
@@ -40,10 +47,11 @@ class StopLane:
     def __init__(self, stop: Callable[[str], None]) -> None:
         self._stop = stop
         self._lock = threading.Lock()
-        self._unread: dict[Hashable, tuple[socket.socket, FindStop]] = {}
+        self._unread: dict[Hashable, Finder] = {}
+        self._peeking: dict[Hashable, socket.socket] = {}
         self._finders: list[Finder] = []
         self._listeners: list[_Listener] = []
-        self._accepted: list[tuple[socket.socket, FindStop]] = []
+        self._accepted: list[Arrival] = []
         self._tasks: set[asyncio.Task[None]] = set()
 
     # ---- On the loop ----
@@ -53,14 +61,20 @@ class StopLane:
         with contextlib.suppress(OSError):  # it has closed already
             own = socket.socket(fileno=os.dup(connection.fileno()))
             with self._lock:
-                self._unread[key] = own, find_stop
+                self._peeking[key] = own
+                self._unread[key] = functools.partial(find_unread, own, find_stop)
+
+    def watch_with(self, key: Hashable, find: Finder) -> None:
+        """Ask FIND, until ``forget`` of KEY: what is unread cannot be peeked at."""
+        with self._lock:
+            self._unread[key] = find
 
     def forget(self, key: Hashable) -> None:
         """Look at it no more; without effect for an unknown KEY."""
         with self._lock:
-            found = self._unread.pop(key, None)
-            if found is not None:
-                found[0].close()
+            self._unread.pop(key, None)
+            if (own := self._peeking.pop(key, None)) is not None:
+                own.close()
 
     def listen(
         self,
@@ -69,9 +83,40 @@ class StopLane:
         make: Callable[[], asyncio.BaseProtocol],
         find_stop: Callable[[socket.socket, bytes], str | None],
     ) -> None:
-        """Accept what waits at LISTENER during a hold, and look at it; LOOP serves it, as MAKE says."""
+        """Accept what waits at LISTENER during a hold, and look at it; LOOP serves it later, as MAKE says.
+
+        FIND_STOP is for a connection that nobody has read from.
+        """
+
+        def arrive(accepted: socket.socket) -> Arrival:
+            find = functools.partial(find_stop, accepted)
+            return Arrival(
+                functools.partial(find_unread, accepted, find),
+                functools.partial(self._serve, loop, make, accepted),
+                accepted.close,
+            )
+
+        self.listen_with(listener, loop, arrive)
+
+    def listen_with(
+        self,
+        listener: socket.socket,
+        loop: asyncio.AbstractEventLoop,
+        arrive: Callable[[socket.socket], Arrival],
+    ) -> None:
+        """Accept what waits at LISTENER during a hold; ARRIVE says, in that thread, what to do with it."""
         with self._lock:
-            self._listeners.append(_Listener(listener, loop, make, find_stop))
+            self._listeners.append(_Listener(listener, loop, arrive))
+
+    def _serve(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        make: Callable[[], asyncio.BaseProtocol],
+        accepted: socket.socket,
+    ) -> None:
+        task = loop.create_task(_connect(loop, make, accepted))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     def look_also(self, find: Finder) -> None:
         """Ask FIND as well: it looks where there is no socket."""
@@ -81,9 +126,12 @@ class StopLane:
     def close(self) -> None:
         """Let go of all."""
         with self._lock:
-            for own, _ in (*self._unread.values(), *self._accepted):
+            for own in self._peeking.values():
                 own.close()
+            for arrival in self._accepted:
+                arrival.close()
             self._unread.clear()
+            self._peeking.clear()
             self._accepted.clear()
             self._listeners.clear()
             self._finders.clear()
@@ -94,8 +142,8 @@ class StopLane:
         """Look at everything once."""
         with self._lock:
             self._accept()
-            found = [find() for find in self._finders]
-            found += [_found(own, find) for own, find in (*self._unread.values(), *self._accepted)]
+            accepted = [arrival.find for arrival in self._accepted]
+            found = [find() for find in (*self._finders, *self._unread.values(), *accepted)]
         for who in found:
             if who is not None:
                 self._stop(who)
@@ -109,33 +157,35 @@ class StopLane:
                 except OSError:
                     break
                 accepted.setblocking(False)
-                own = accepted.dup()
-                self._accepted.append((own, functools.partial(listener.find_stop, own)))
+                arrival = listener.arrive(accepted)
+                self._accepted.append(arrival)
                 try:
-                    listener.loop.call_soon_threadsafe(self._hand_over, listener, accepted)
+                    listener.loop.call_soon_threadsafe(self._hand_over, arrival)
                 except RuntimeError:  # the loop has ended
-                    accepted.close()
+                    arrival.close()
 
-    def _hand_over(self, listener: _Listener, accepted: socket.socket) -> None:
-        """Have the loop serve ACCEPTED, and forget what was accepted: on the loop."""
+    def _hand_over(self, arrival: Arrival) -> None:
+        """Have the loop serve it, and look at it no more, unless the loop says so: on the loop."""
         with self._lock:
-            for own, _ in self._accepted:
-                own.close()
-            self._accepted.clear()
-        task = listener.loop.create_task(self._serve(listener, accepted))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def _serve(self, listener: _Listener, accepted: socket.socket) -> None:
-        try:
-            await listener.loop.connect_accepted_socket(listener.make, accepted)
-        except OSError:  # it has left
-            accepted.close()
+            if arrival not in self._accepted:
+                return  # the lane was closed
+            self._accepted.remove(arrival)
+        arrival.serve()
 
 
-def _found(own: socket.socket, find_stop: FindStop) -> str | None:
+def find_unread(opened: socket.socket, find_stop: FindStop) -> str | None:
+    """Return who stops the machine with what OPENED has unread, which stays there."""
     try:
-        data = own.recv(PEEK_BYTES, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        data = opened.recv(PEEK_BYTES, socket.MSG_PEEK | socket.MSG_DONTWAIT)
     except OSError:
         data = b""
     return find_stop(data)
+
+
+async def _connect(
+    loop: asyncio.AbstractEventLoop, make: Callable[[], asyncio.BaseProtocol], accepted: socket.socket
+) -> None:
+    try:
+        await loop.connect_accepted_socket(make, accepted)
+    except OSError:  # it has left
+        accepted.close()

@@ -5,12 +5,17 @@ refuse them. So connections are accepted here (docs/adr/0013-network-edge.md).
 """
 
 import asyncio
+import contextlib
+import functools
 import resource
 import socket
 import ssl
 from collections import Counter
 from collections.abc import Callable
 from typing import Final
+
+from coordinator.ipc.server.stop_lane import Arrival, StopLane, find_unread
+from coordinator.ipc.server.tls_transport import TlsState, serve_tls
 
 BACKLOG: Final = 128
 HANDSHAKES_MAX: Final = 128
@@ -28,10 +33,15 @@ def _always(_: int) -> bool:
     return True
 
 
+def _nobody(_: str, _unread: bytes) -> None:
+    return None
+
+
 class TcpListener:
     """A TCP port, with TLS where there is a CONTEXT. MAKE_PROTOCOL makes the protocol of each connection.
 
-    MAY_ENTER gets how many connections are being set up, and returns whether there may be one more.
+    MAY_ENTER gets how many connections are being set up, and returns whether there may be one more. With a
+    STOP_LANE others may come in while the loop is held; FIND_STOP gets an address, and what came from there.
     """
 
     def __init__(
@@ -41,11 +51,15 @@ class TcpListener:
         *,
         handshakes_max: int = HANDSHAKES_MAX,
         may_enter: Callable[[int], bool] = _always,
+        stop_lane: StopLane | None = None,
+        find_stop: Callable[[str, bytes], str | None] = _nobody,
     ) -> None:
         self._make_protocol = make_protocol
         self._context = context
         self._handshakes_max = handshakes_max
         self._may_enter = may_enter
+        self._stop_lane = stop_lane
+        self._find_stop = find_stop
         self._listeners: list[socket.socket] = []
         self._accepting: list[asyncio.Task[None]] = []
         self._entering: dict[asyncio.Task[None], str] = {}
@@ -71,6 +85,9 @@ class TcpListener:
         finally:
             server.close()
         self._accepting = [loop.create_task(self._accept(listener)) for listener in self._listeners]
+        if self._stop_lane is not None:
+            for listener in self._listeners:
+                self._stop_lane.listen_with(listener, loop, functools.partial(self._arrive, loop))
 
     @property
     def addresses(self) -> list[tuple[str, int]]:
@@ -108,15 +125,44 @@ class TcpListener:
             if taken % ACCEPTS_PER_ROUND == 0:
                 await asyncio.sleep(0)  # sock_accept returns without a pause while some wait
 
-    def _take(self, opened: socket.socket, address: str, loop: asyncio.AbstractEventLoop) -> None:
+    def _arrive(self, loop: asyncio.AbstractEventLoop, opened: socket.socket) -> Arrival:
+        """Look for a stop in what OPENED sends, accepted by the stop lane, in its thread."""
+        address = _address_of(opened)
+        find_stop = functools.partial(self._find_stop, address)
+        if self._context is None:
+            find = functools.partial(find_unread, opened, find_stop)
+            return Arrival(find, lambda: self._take(opened, address, loop), opened.close)
+        tls = TlsState(opened.dup(), self._context)
+
+        def find_in_tls() -> str | None:
+            if tls.receive():
+                with contextlib.suppress(OSError):
+                    opened.sendall(tls.outgoing())  # of the handshake: there is room for it
+            return find_stop(tls.waiting)
+
+        def close() -> None:
+            tls.release()
+            opened.close()
+
+        return Arrival(find_in_tls, lambda: self._take(opened, address, loop, tls), close)
+
+    def _take(
+        self,
+        opened: socket.socket,
+        address: str,
+        loop: asyncio.AbstractEventLoop,
+        tls: TlsState | None = None,
+    ) -> None:
         if self._context is not None and len(self._entering) >= self._handshakes_max:
             self._make_room()
         if not self._may_enter(len(self._entering)):
             self.refused += 1
             opened.close()
+            if tls is not None:
+                tls.release()
             return
         arrived = [opened]
-        task = loop.create_task(self._enter(arrived, loop))
+        task = loop.create_task(self._enter(arrived, loop, tls))
         self._entering[task] = address
         task.add_done_callback(lambda task: self._done(task, arrived))
 
@@ -128,16 +174,14 @@ class TcpListener:
         oldest.cancel()
         self.refused += 1
 
-    async def _enter(self, arrived: list[socket.socket], loop: asyncio.AbstractEventLoop) -> None:
-        limit_s = None if self._context is None else HANDSHAKE_S
+    async def _enter(
+        self, arrived: list[socket.socket], loop: asyncio.AbstractEventLoop, tls: TlsState | None
+    ) -> None:
         try:
-            await loop.connect_accepted_socket(
-                self._make_protocol,
-                arrived.pop(),
-                ssl=self._context,
-                ssl_handshake_timeout=limit_s,
-                ssl_shutdown_timeout=limit_s,
-            )
+            if self._context is None:
+                await loop.connect_accepted_socket(self._make_protocol, arrived.pop())
+            else:
+                await serve_tls(self._make_protocol, arrived.pop(), self._context, HANDSHAKE_S, tls)
         except OSError:  # no TLS, not in time, or gone; errors of TLS are OSErrors as well
             return
 
@@ -145,6 +189,13 @@ class TcpListener:
         self._entering.pop(task, None)
         for opened in arrived:  # it was cancelled before its first step
             opened.close()
+
+
+def _address_of(opened: socket.socket) -> str:
+    try:
+        return str(opened.getpeername()[0])
+    except OSError:  # it has left
+        return "unknown"
 
 
 def raise_files_limit() -> None:

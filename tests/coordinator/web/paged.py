@@ -29,12 +29,13 @@ class Paged:
     http: aiohttp.ClientSession
     key: str = ""
     """Of the session, once the browser has signed in."""
+    scheme: str = "http"
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
     """That of the servers."""
 
     @property
     def at(self) -> str:
-        return f"http://127.0.0.1:{self.page.port}"
+        return f"{self.scheme}://127.0.0.1:{self.page.port}"
 
     def socket(self, **headers: str) -> Any:
         """Connect as the page's script does."""
@@ -71,8 +72,9 @@ class Paged:
 
 
 def browser() -> aiohttp.ClientSession:
-    """Return a browser that keeps cookies, as all do; of IP addresses, too."""
-    return aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True))
+    """Return a browser that keeps cookies, as all do; of IP addresses, too, and trusts any certificate."""
+    connector = aiohttp.TCPConnector(ssl=False)
+    return aiohttp.ClientSession(connector=connector, cookie_jar=aiohttp.CookieJar(unsafe=True))
 
 
 @contextlib.asynccontextmanager
@@ -83,7 +85,7 @@ async def paging(folder: Path, page: WebSettings = LOOPBACK, **settings: Any) ->
         await server.start()
         try:
             async with browser() as http:
-                yield Paged(served, server, http)
+                yield Paged(served, server, http, scheme="http" if page.certificate is None else "https")
         finally:
             await served.server.close()
             await server.close()

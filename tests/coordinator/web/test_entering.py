@@ -222,11 +222,10 @@ def test_with_tls_the_cookie_is_never_sent_without(tmp_path: Path, certificate: 
     settings = WebSettings(host="127.0.0.1", port=0, certificate=certificate[0], private_key=certificate[1])
 
     async def go(paged: Paged) -> None:
-        at = f"https://127.0.0.1:{paged.page.port}"
         link = paged.page.new_link(Scope.WATCH)
-        assert link.startswith(f"{at}/#")
+        assert link.startswith(f"https://127.0.0.1:{paged.page.port}/#")
         asked = {"token": code_of(link)}
-        posted = paged.http.post(f"{at}/login", json=asked, headers={"Origin": at}, ssl=False)
+        posted = paged.http.post(f"{paged.at}/login", json=asked, headers={"Origin": paged.at})
         async with posted as answer:
             (cookie,) = answer.cookies.values()
         assert cookie["secure"]

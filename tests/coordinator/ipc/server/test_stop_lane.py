@@ -3,6 +3,10 @@
 import asyncio
 import json
 import socket
+import ssl
+import time
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +14,19 @@ import pytest
 
 from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.settings import TcpSettings
 from coordinator.ipc.server.stop_lane import StopLane
+from coordinator.web.settings import WebSettings
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, run
 from tests.coordinator.web.paged import LOOPBACK, Paged, paging
 from tests.stages import jump_loop
 
 HELLO: dict[str, Any] = {"id": 1, "method": "api.hello", "params": {"version": 1, "client": "new"}}
+PATIENCE_S = 30.0
 STOP: dict[str, Any] = {"id": 2, "method": "machine.emergency_stop", "params": {"who": "me"}}
+
+
+TLS = pytest.mark.parametrize("secret", [False, True], ids=["plain", "tls"])
 
 
 def line(message: object) -> bytes:
@@ -34,6 +44,13 @@ class Lane(StopLane):
         """Look once, as the watchdog's thread does; return who stopped the machine by then."""
         self.look()
         return self.stops
+
+    def sees(self, stops: list[str]) -> bool:
+        """Look until STOPS have been seen, which may take a moment; return whether there were no others."""
+        until_s = time.monotonic() + PATIENCE_S
+        while self.seen() != stops and len(self.stops) < len(stops) and time.monotonic() < until_s:
+            pass
+        return self.stops == stops
 
 
 def test_a_client_stops_the_machine_and_gets_its_answer_later(tmp_path: Path) -> None:
@@ -127,8 +144,10 @@ def test_over_tcp_the_rights_of_the_token_count(tmp_path: Path) -> None:
     run(tmp_path, go, stop_lane=lane, tcp=plain_tcp(tmp_path))
 
 
-def test_the_page_stops_the_machine(tmp_path: Path) -> None:
-    lane = Lane()
+@TLS
+def test_the_page_stops_the_machine(tmp_path: Path, certificate: tuple[Path, Path], *, secret: bool) -> None:
+    lane, (pem, key) = Lane(), certificate
+    settings = WebSettings(host="127.0.0.1", port=0, certificate=pem, private_key=key) if secret else LOOPBACK
 
     async def go(paged: Paged) -> None:
         for scope, stops in ((Scope.WATCH, []), (Scope.OPERATE, ["me"])):
@@ -138,10 +157,10 @@ def test_the_page_stops_the_machine(tmp_path: Path) -> None:
                     await other.hello(page)
                     await page.ping()
                     await page.send_str(json.dumps(STOP))
-                    assert lane.seen() == stops
+                    assert lane.sees(stops)
 
     async def main() -> None:
-        async with paging(tmp_path, LOOPBACK, stop_lane=lane) as paged:
+        async with paging(tmp_path, settings, stop_lane=lane) as paged:
             await go(paged)
 
     jump_loop.run(main())
@@ -159,3 +178,103 @@ def test_a_client_that_has_left_is_forgotten(tmp_path: Path) -> None:
         assert lane.seen() == []
 
     run(tmp_path, go, stop_lane=lane)
+
+
+def over(folder: Path, certificate: tuple[Path, Path] | None) -> TcpSettings:
+    """Return the settings of TCP with or without TLS."""
+    plain = plain_tcp(folder)
+    if certificate is None:
+        return plain
+    return replace(plain, plain_on_loopback=False, certificate=certificate[0], private_key=certificate[1])
+
+
+class Dialled:
+    """A client whose bytes the test moves itself, with TLS or without: its loop gets no turn."""
+
+    def __init__(self, port: int, certificate: tuple[Path, Path] | None) -> None:
+        self._socket = socket.create_connection(("127.0.0.1", port))
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.settimeout(0.0)
+        self._tls: ssl.SSLObject | None = None
+        self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        if certificate is not None:
+            trusting = ssl.create_default_context(cafile=str(certificate[0]))
+            self._tls = trusting.wrap_bio(self._incoming, self._outgoing, server_hostname="127.0.0.1")
+
+    def shake_hands(self) -> bool:
+        """Do what can be done of the handshake; return whether it is done."""
+        if self._tls is None:
+            return True
+        with suppress(BlockingIOError):
+            self._incoming.write(self._socket.recv(65_536))
+        done = True
+        try:
+            self._tls.do_handshake()
+        except ssl.SSLWantReadError:
+            done = False
+        self._socket.sendall(self._outgoing.read())
+        return done
+
+    def send(self, data: bytes) -> None:
+        if self._tls is None:
+            self._socket.sendall(data)
+            return
+        self._tls.write(data)
+        self._socket.sendall(self._outgoing.read())
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@TLS
+@pytest.mark.parametrize("scope", [Scope.WATCH, Scope.OPERATE])
+def test_a_new_connection_over_tcp(
+    tmp_path: Path, certificate: tuple[Path, Path], scope: Scope, *, secret: bool
+) -> None:
+    """It comes, shakes hands and stops the machine while the loop has no turn; then it gets its answer."""
+    lane, chosen = Lane(), certificate if secret else None
+
+    async def go(served: Served) -> None:
+        dialled = Dialled(served.server.tcp_port or 0, chosen)
+        while not dialled.shake_hands():
+            assert lane.seen() == []
+        dialled.send(line({**HELLO, "params": {"version": 1, "token": "x" * 32}}) + line(STOP))
+        assert lane.seen() == [], "nobody knows that token"
+        dialled.close()
+        dialled = Dialled(served.server.tcp_port or 0, chosen)
+        while not dialled.shake_hands():
+            assert lane.seen() == []
+        dialled.send(line({**HELLO, "params": {"version": 1, "token": TOKENS[scope]}}))
+        assert lane.seen() == []
+        dialled.send(line(STOP))
+        assert lane.sees(["me"] if scope is Scope.OPERATE else [])
+        assert served.stops == []
+        await asyncio.sleep(0.1)
+        assert served.stops == lane.stops[:1], "the loop has read it, too"
+        assert served.server.figures()["connections"] == 1
+        dialled.close()
+        await served.server_has(0)
+
+    run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, chosen))
+
+
+def test_a_connection_with_tls_that_exists(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
+    lane = Lane()
+
+    async def go(served: Served) -> None:
+        trusting = ssl.create_default_context(cafile=str(certificate[0]))
+        for scope, stops in ((Scope.WATCH, []), (Scope.OPERATE, ["me"])):
+            reader, writer = await asyncio.open_connection(
+                "127.0.0.1", served.server.tcp_port, ssl=trusting, server_hostname="127.0.0.1"
+            )
+            writer.write(line({**HELLO, "params": {"version": 1, "token": TOKENS[scope]}}))
+            await reader.readline()
+            writer.write(line({"id": 7, "method": "machine.info"}) + line(STOP))
+            assert lane.sees(stops)
+            answers = [json.loads(await reader.readline()) for _ in range(2)]
+            assert {answer["id"] for answer in answers} == {2, 7}, "what the lane took is not lost"
+            assert served.stops == stops
+            writer.close()
+        await served.server_has(0)
+
+    run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, certificate))
