@@ -83,7 +83,8 @@ class AnalogIn(Device):
         self._on_report(node, "analog_in_state", self._received)
         self._outside = None
         node.explain_shutdown(self._explain)
-        clock = start_clock(node) % 2**32
+        period = self._times["rest_ticks"]  # all in step: reports that come together wake the host once
+        clock = -(-start_clock(node) // period) * period % 2**32
         node.send("query_analog_in", oid=self._oid, clock=clock, **self._times, **self._limits)
 
     def stop(self, node: Node) -> None:

@@ -11,7 +11,7 @@ from coordinator.service.core.feeder import Feeder, QueuedWork
 from coordinator.service.core.motion_lead import MotionLead
 from coordinator.service.core.work import LinesWork, Work
 from coordinator.service.state.toolpath import Toolpath
-from coordinator.service.state.trace import KEEP_S, Moment, MotionTrace
+from coordinator.service.state.trace import FRESH_MAX, KEEP_S, Moment, MotionTrace
 from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import Planned, ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
@@ -48,7 +48,7 @@ class Motion:
             has_jobs=has_jobs,
         )
         self.trace = MotionTrace(len(machine.moving))
-        self.toolpath = Toolpath()
+        self._toolpath = Toolpath()
         self.planned = UNMOVED
         self.lead = MotionLead()
         self.streamer = Streamer(
@@ -138,6 +138,12 @@ class Motion:
             return Moment(self.planned.position, 0.0, found.line if found else 0, moving=False)
         return self.trace.at(now_s) or Moment(self.planned.position, 0.0, 0, moving=False)
 
+    @property
+    def toolpath(self) -> Toolpath:
+        """The path as planned so far."""
+        self._toolpath.add(self.trace.take_fresh())
+        return self._toolpath
+
     # ----------------------------------------------------------------------------------- cycle by cycle
 
     def _cycle_ended(self, planned: Planned) -> None:
@@ -147,7 +153,8 @@ class Motion:
         comes_to_rest = planned.stands_from_s is not None
         self.lead.look(now_s, self.streamer.worker.steps.generated_until, comes_to_rest=comes_to_rest)
         self.trace.forget_before_s = now_s - KEEP_S
-        self.toolpath.add(self.trace.take_fresh())
+        if self.trace.fresh_batches > FRESH_MAX // 4:
+            self._toolpath.add(self.trace.take_fresh())
         with contextlib.suppress(IndexError):
             while True:
                 self._ending.append(self.feeder.finished.popleft())

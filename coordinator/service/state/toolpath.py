@@ -41,9 +41,11 @@ class Toolpath:
         last = self._at[self._count - 1 : self._count]
         before = np.vstack((last if len(self) else start[:1] - 1.0, end[:-1]))
         jumps = np.flatnonzero(np.abs(start - before).max(axis=1) > _SAME_MM)
-        at = np.insert(end, jumps, start[jumps], axis=0)
-        time_s = np.insert(end_s, jumps, moves["print_time"][jumps])
-        extrudes = np.insert(ratio[:, 3] > 0, jumps, False)
+        at, time_s, extrudes = end, end_s, ratio[:, 3] > 0
+        if len(jumps):
+            at = np.insert(at, jumps, start[jumps], axis=0)
+            time_s = np.insert(time_s, jumps, moves["print_time"][jumps])
+            extrudes = np.insert(extrudes, jumps, False)
         moved = np.abs(np.diff(np.vstack((last, at)), axis=0)).max(axis=1) > _SAME_MM
         kept = moved if len(self) else np.concatenate(([True], moved))
         self._append(at[kept], time_s[kept], extrudes[kept])

@@ -123,6 +123,11 @@ class MotionTrace:
         every = np.concatenate(found) if found else np.empty(0)
         return (float(every.min()), float(every.max())) if len(every) else None
 
+    @property
+    def fresh_batches(self) -> int:
+        """How many batches of moves wait for ``take_fresh``."""
+        return len(self._fresh)
+
     def take_fresh(self) -> Moves:
         """Return the moves that came since this was called last; of too many the newest."""
         new: list[Moves] = []

@@ -20,6 +20,21 @@ def sensor(machine_pin: str = "PC2", **limits: float) -> tuple[AnalogIn, list[An
     return analog, seen
 
 
+def test_sensors_of_a_node_report_together() -> None:
+    """Reports that come at different times wake the host twice as often."""
+    sensors = [sensor(), sensor("PC3")]
+    machine = DeviceMachine(*(analog for analog, _ in sensors))
+
+    async def main() -> None:
+        await asyncio.sleep(0.5)
+        sensors[1][0].started(machine.node)  # later than the other one
+        await asyncio.sleep(1.0)
+
+    machine.run(main)
+    first, second = (seen[-1] for _, seen in sensors)
+    assert (first.clock32 - second.clock32) % round(0.3 * HZ) == 0
+
+
 def test_measurements_come_with_their_time_over_the_rollover() -> None:
     analog, seen = sensor()
     machine = DeviceMachine(analog, rolls_over_s=4.0)
