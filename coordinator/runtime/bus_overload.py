@@ -20,6 +20,8 @@ class BusOverload(CanductorError):  # noqa: N818
 
 LOSSY: Final = 0.15
 """With more blocks sent again than that it is losses that make motion late; a full bus alone causes a few."""
+BLOCKED: Final = 0.72
+"""With so much of a bus's time taken by what is received, that makes motion late, whatever is planned."""
 
 
 @dataclass(slots=True)
@@ -29,10 +31,17 @@ class BusOverloadDetector:
     name: str
     _late_since_ns: int | None = None
 
-    def look(self, forecast: Forecast, now: HostTime, repeated: Callable[[], float]) -> None:
+    def look(
+        self,
+        forecast: Forecast,
+        now: HostTime,
+        repeated: Callable[[], float],
+        taken: Callable[[], float],
+    ) -> None:
         """Take the newest forecast; raises BusOverload when motion would be late for certain.
 
-        REPEATED returns the share of the blocks on this bus that had to be sent again.
+        REPEATED returns the share of the blocks on this bus that had to be sent again, TAKEN the share of its
+        time that received frames took lately, acknowledgements and those of low priority aside.
         """
         warning_s = forecast.warning_s
         if warning_s is None:
@@ -43,6 +52,11 @@ class BusOverloadDetector:
         if now - self._late_since_ns < PERSISTS_S * 1e9 and warning_s > URGENT_S:
             return
         late = f"the first step commands would be late in {max(warning_s, 0):.1f} s"
+        if (share := taken()) > BLOCKED:
+            raise BusOverload(
+                f"bus {self.name} is blocked: received frames take {share:.0%} of its time, and {late}; "
+                "find the board that sends them, and take it off the bus"
+            )
         if (share := repeated()) > LOSSY:
             raise BusOverload(
                 f"bus {self.name} loses too much: {share:.0%} of the blocks on it had to be sent again, "

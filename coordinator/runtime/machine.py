@@ -335,7 +335,10 @@ class Machine:
         for opened in self._open:
             if opened.bus.closed_because is None:
                 opened.watch.look(
-                    opened.bus.io.forecast(), self.host.now(), functools.partial(_repeated, opened.bus)
+                    opened.bus.io.forecast(),
+                    self.host.now(),
+                    functools.partial(_repeated, opened.bus),
+                    functools.partial(_taken, opened.bus),
                 )
 
     def is_busy(self, load: float) -> bool:
@@ -437,6 +440,11 @@ def _repeated(bus: CanBus | UartBus) -> float:
     """Return the share of the blocks sent on BUS that were repeats."""
     stats = [link_of(node).stats() for node in bus.nodes if node.talks]
     return sum(s.blocks_repeated for s in stats) / max(1, sum(s.blocks_sent for s in stats))
+
+
+def _taken(bus: CanBus | UartBus) -> float:
+    """Return the share of the time of BUS that received frames took lately which nothing here outranks."""
+    return bus.io.load().data if isinstance(bus, CanBus) else 0.0
 
 
 def _first_cause(group: BaseExceptionGroup[BaseException]) -> BaseException:

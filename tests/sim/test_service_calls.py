@@ -208,3 +208,19 @@ def test_what_front_ends_see(tmp_path: Path) -> None:
         assert info["machine"]["nodes"] == ["mcu", "toolhead", "zboard"]
 
     machine.serve(go, node_commands=True)
+
+
+def test_motion_is_told_before_it_has_begun(tmp_path: Path) -> None:
+    """In the first moments of a start; failed before, as the clocks of the nodes were not mapped yet."""
+    machine = DemoMachine(tmp_path)
+
+    async def go(stage: Served) -> None:
+        old = stage.service.motion
+        await stage.call("machine.restart")
+        while (motion := stage.service.motion) is None or motion is old:  # noqa: ASYNC110 (virtual time)
+            await asyncio.sleep(0.0005)
+        told = await stage.call("motion.dump", seconds=10)
+        assert not motion.begun.is_set(), "this is what is tested"
+        assert told["moves"]["print_time"] == []
+
+    machine.serve(go)

@@ -13,8 +13,14 @@ def forecast(now_s: float, late_in_s: float | None, ratio: float = 1.3) -> Forec
     return Forecast(now_ns, ratio, now_ns, late_ns, 350_000.0, 10_000)
 
 
-def look(watch: BusOverloadDetector, now_s: float, late_in_s: float | None, repeated: float = 0.01) -> None:
-    watch.look(forecast(now_s, late_in_s), HostTime(round(now_s * 1e9)), lambda: repeated)
+def look(
+    watch: BusOverloadDetector,
+    now_s: float,
+    late_in_s: float | None,
+    repeated: float = 0.01,
+    taken: float = 0.6,
+) -> None:
+    watch.look(forecast(now_s, late_in_s), HostTime(round(now_s * 1e9)), lambda: repeated, lambda: taken)
 
 
 def test_a_passing_doubt_is_no_overload() -> None:
@@ -41,6 +47,11 @@ def test_a_lasting_one_is_said_long_before_the_first_late_step() -> None:
 def test_losses_are_named_as_what_they_are() -> None:
     with pytest.raises(BusOverload, match="bus can0 loses too much: 23% of the blocks"):
         look(BusOverloadDetector("can0"), 1.0, 0.1, repeated=0.23)
+
+
+def test_a_bus_that_is_full_of_others_frames_is_blocked() -> None:
+    with pytest.raises(BusOverload, match="bus can0 is blocked: received frames take 91% of its time"):
+        look(BusOverloadDetector("can0"), 1.0, 0.1, repeated=0.23, taken=0.91)
 
 
 def test_what_is_near_is_said_at_once() -> None:
