@@ -178,18 +178,19 @@ class MotionWorker:
         due, self.pipeline.due = self.pipeline.due, []
         if self._compensation is not None:
             self._compensation.note(self.steps)
-        return Cycle(batches, list(output), event, self._planned(), due, self._stepping() if batches else [])
+        steppers = self.steps.stepper_stats()
+        stepping = self._stepping(steppers) if batches else []
+        return Cycle(batches, list(output), event, self._planned(steppers), due, stepping)
 
-    def _stepping(self) -> list[str]:
+    def _stepping(self, steppers: Sequence[StepperStats]) -> list[str]:
         """Return the steppers for which steps were made since the last time."""
-        made = {s.name: s.steps for s in self.steps.stats().steppers}
+        made = {s.name: s.steps for s in steppers}
         before, self._made = self._made, made
         return [name for name, steps in made.items() if steps != before.get(name, 0)]
 
-    def _planned(self) -> Planned:
+    def _planned(self, steppers: Sequence[StepperStats]) -> Planned:
         planner = self._planner
         stands = planner.at_standstill and not planner.take().count
-        steppers = self.steps.stats().steppers
         return Planned(
             position=planner.toolhead_position,
             gcode=planner.gcode_position,
@@ -234,7 +235,7 @@ class MotionWorker:
 
     def _counts(self) -> dict[str, int]:
         """Return where the nodes will count the steppers when all that was made is executed."""
-        return {stepper.name: self._count(stepper) for stepper in self.steps.stats().steppers}
+        return {stepper.name: self._count(stepper) for stepper in self.steps.stepper_stats()}
 
     def _count(self, stepper: StepperStats) -> int:
         return stepper.issued + self.began_at.get(stepper.name, 0)

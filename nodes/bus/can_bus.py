@@ -309,6 +309,10 @@ class _CanConnector:
                 "only one host assign ids on this bus"
             )
 
+    @property
+    def can_suspect(self) -> bool:
+        return True
+
     def suspect(self) -> None:
         self._bus.suspect()
 

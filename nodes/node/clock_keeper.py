@@ -71,6 +71,9 @@ class ClockKeeper:
 
     async def _wait_watching(self, wait_s: float) -> None:
         """Wait, and have the bus check the node when it owes an acknowledgement and is silent."""
+        if not self._connector.can_suspect:
+            await asyncio.sleep(wait_s)
+            return
         if self._talk.connected:
             self._talk.link.on_sent = self._watch_silence
         if self._owes():

@@ -310,10 +310,11 @@ class StepGenerator:
 
     def stats(self) -> StepStats:
         """Return the totals of every stepper and node."""
-        return StepStats(
-            tuple(self._stepper_stats(i) for i in range(len(self._steppers))),
-            tuple(self._node_stats(i) for i in range(len(self._nodes))),
-        )
+        return StepStats(self.stepper_stats(), tuple(self._node_stats(i) for i in range(len(self._nodes))))
+
+    def stepper_stats(self) -> tuple[StepperStats, ...]:
+        """Return the totals of every stepper."""
+        return tuple(self._stepper_stats(i) for i in range(len(self._steppers)))
 
     def _stepper_stats(self, index: int) -> StepperStats:
         self._check_stepper(index)

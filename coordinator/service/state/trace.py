@@ -76,7 +76,7 @@ class MotionTrace:
         while len(kept) > 1 and _end_s(kept[0][-1]) < self.forget_before_s:
             del kept[0]  # the last one stays: it is where the machine stands
         if kept and len(kept[-1]) + count <= PIECE_MOVES:
-            kept[-1] = np.concatenate((kept[-1], new))
+            kept[-1] = _joined((kept[-1], new))
         else:
             kept.append(new)
         while len(kept) > 1 and sum(map(len, kept)) > MOVES_MAX:
@@ -107,7 +107,7 @@ class MotionTrace:
     def moves(self, since_s: float) -> Moves:
         """Return the moves that end after print time SINCE_S, oldest first."""
         pieces = self._pieces
-        every = np.concatenate(pieces) if pieces else np.empty(0, TRAPEZOID)
+        every = _joined(pieces)
         ends = every["print_time"] + every["accel_s"] + every["cruise_s"] + every["decel_s"]
         kept: Moves = every[ends > since_s]
         return kept
@@ -134,7 +134,7 @@ class MotionTrace:
         with contextlib.suppress(IndexError):
             while True:
                 new.append(self._fresh.popleft())
-        return np.concatenate(new) if new else np.empty(0, TRAPEZOID)
+        return _joined(new)
 
     def batches(self, node: int) -> tuple[bytes, ...]:
         """Return what was sent to a moving node, oldest first."""
@@ -144,6 +144,11 @@ class MotionTrace:
         """Return how many batches a node has got, and of those beyond the first SEEN what is still kept."""
         total, kept = self._batches_seen[node], self._batches[node]
         return total, tuple(islice(kept, max(0, len(kept) - (total - seen)), None))
+
+
+def _joined(pieces: Sequence[Moves]) -> Moves:
+    """Return PIECES as one array, in a fraction of what np.concatenate takes for records."""
+    return np.frombuffer(b"".join(piece.tobytes() for piece in pieces), TRAPEZOID)
 
 
 def _end_s(move: Any) -> float:

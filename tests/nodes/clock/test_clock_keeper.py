@@ -60,6 +60,8 @@ class Bench:
         self.blocks.append((content_bytes, bitrate, answer))
         return BACK_NS if answer else OUT_NS
 
+    can_suspect = True
+
     def suspect(self) -> None:
         self.suspected_s.append(asyncio.get_running_loop().time())
 
@@ -162,6 +164,20 @@ def test_an_answer_of_unknown_times_is_not_used() -> None:
         assert keeper.estimator.unusable == 1
         assert len(bench.estimates) == known == len(bench.link.clocks)
         assert len(bench.sampled_s) == known + 1, "it is a sign of life nevertheless"
+
+    bench.run(main)
+
+
+def test_silence_is_not_watched_where_nothing_can_be_found_out() -> None:
+    bench = Bench()
+    bench.can_suspect = False
+
+    async def main(keeper: ClockKeeper) -> None:
+        await keeper.ready.wait()
+        bench.link.queue()
+        await asyncio.sleep(0.9)
+        assert bench.link.looks == 0, "it would wake the computer for nothing"
+        assert bench.suspected_s == []
 
     bench.run(main)
 
