@@ -23,7 +23,7 @@ from coordinator.streaming.worker import SEND_AHEAD_S, START_LEAD_S, Cycle, Moti
 from nodes.support.errors import CanductorError
 
 CYCLE_S: Final = 0.05
-FULL_CYCLE_S: Final = 0.45
+FULL_CYCLE_S: Final = 0.4
 """While planner and commands reach as far ahead as they may; taken off the lead of SEND_AHEAD_S."""
 REST_CYCLE_S: Final = 1.0
 """At rest, where a cycle only steers the clocks of secondary nodes, predicted over a second."""

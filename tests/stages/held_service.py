@@ -10,6 +10,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from coordinator.assembly.load import load_machine
 from coordinator.front_ends.stop_path import StopPath
@@ -43,6 +44,8 @@ class HeldService:
         self.lines: list[str] = []
         self.service: MachineService
         self.loop: asyncio.AbstractEventLoop
+        self.tree = StateTree()
+        self.stop_path: StopPath
         self.terminal = -1
         """Where a user types."""
 
@@ -65,10 +68,10 @@ class HeldService:
             assert time.monotonic() < deadline_s, f"no end of waiting until {what}: {self.lines[-5:]}"
             time.sleep(0.005)
 
-    def restart(self) -> None:
+    def restart(self, *, firmware: bool = True) -> None:
         """Start the machine that was stopped again."""
         self.wait_for(lambda: self.service.state is ServiceState.SHUTDOWN, "it is shut down")
-        self.loop.call_soon_threadsafe(lambda: self.service.restart(firmware=True))
+        self.loop.call_soon_threadsafe(lambda: self.service.restart(firmware=firmware))
         self.wait_for(lambda: self.service.state is ServiceState.STARTUP, "it starts")
         self.ready()
 
@@ -91,7 +94,7 @@ class HeldService:
     async def serve(self, test: Callable[[], None]) -> None:
         """Serve until TEST, in a thread, has ended; raises what it raised."""
         self.loop = asyncio.get_running_loop()
-        async with self._interfaces():
+        async with self.interfaces():
             testing = asyncio.ensure_future(asyncio.to_thread(test))
             serving = asyncio.ensure_future(self.service.run())
             try:
@@ -102,19 +105,20 @@ class HeldService:
             await testing
 
     @asynccontextmanager
-    async def _interfaces(self) -> AsyncIterator[None]:
-        registry, tree = Registry(), StateTree()
+    async def interfaces(self) -> AsyncIterator[None]:
+        """Serve on all ways in."""
+        registry = Registry()
         settings = ServiceSettings(name="held", jobs=self.folder)
         self.service = MachineService(
             lambda: load_machine(str(self.folder / CONFIG)),
             LinuxHost(),
-            tree,
+            self.tree,
             settings,
             on_line=lambda entry: self.lines.append(str(entry["text"])),
         )
         add_methods(self.service, registry)
-        path = StopPath(self.service)
-        server = IpcServer(registry, tree, IpcSettings(unix_path=self.socket), stop_lane=path.lane)
+        path = self.stop_path = StopPath(self.service)
+        server = IpcServer(registry, self.tree, IpcSettings(unix_path=self.socket), stop_lane=path.lane)
         gateway = Gateway(
             self.service, self.folder / CONFIG, on_notice=self.lines.append, stop_lane=path.lane
         )
@@ -132,9 +136,16 @@ class HeldService:
             await gateway.close()
 
 
-def serve_held(folder: Path, test: Callable[[HeldService], None]) -> None:
-    """Run TEST with a service in FOLDER."""
-    held = HeldService(folder)
+H = TypeVar("H", bound=HeldService)
+
+
+def serve_held(
+    folder: Path,
+    test: Callable[[H], None],
+    kind: type[H] = HeldService,  # type: ignore[assignment]
+) -> None:
+    """Run TEST with a service in FOLDER, of this KIND."""
+    held = kind(folder)
     stdin = sys.stdin
     held.terminal, theirs = pty.openpty()
     with real_nodes(MACHINE, folder), contextlib.ExitStack() as stack:

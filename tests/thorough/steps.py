@@ -89,6 +89,12 @@ def steps(amount: Amount) -> Iterator[Step]:
     yield Step("fuzz-mt", "the table receiver under the sanitizers", (*fuzz, "mt"), _FUZZ_FIGURE)
     yield Step("fuzz-live", "the sockets of a machine that prints", (*fuzz, "live"), r"^lead lost.*$")
     yield Step(
+        "fuzz-stops",
+        "emergency stops while fuzzers are at all ways in",
+        (*fuzz, "stops"),
+        r"^loop held: .*$",
+    )
+    yield Step(
         "octoprint",
         "OctoPrint prints over a pseudo-terminal",
         ("make", "octoprint"),

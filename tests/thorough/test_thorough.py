@@ -27,6 +27,7 @@ def test_the_steps_are_those_of_the_manual() -> None:
         "fuzz",
         "fuzz-mt",
         "fuzz-live",
+        "fuzz-stops",
         "octoprint",
         "soak",
     ]
