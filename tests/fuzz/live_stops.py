@@ -32,7 +32,7 @@ from typing import Any, Final
 
 from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.protocol.limits import Limits
-from coordinator.ipc.protocol.methods import Registry, Scope
+from coordinator.ipc.protocol.methods import ApiError, Registry, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.service.api.methods import add_methods
@@ -120,12 +120,17 @@ def hello(token: str | None = None) -> bytes:
 STOP: Final = line({"id": 2, "method": "machine.emergency_stop", "params": {}})
 
 
+def come(opened: socket.socket, address: str | tuple[str, int], data: bytes) -> None:
+    """Connect to ADDRESS and send DATA."""
+    opened.connect(address)
+    opened.sendall(data)
+
+
 @contextlib.contextmanager
 def unix(held: FuzzedService) -> Iterator[Send]:
     """A connection to the Unix socket that comes with its stop."""
     with socket.socket(socket.AF_UNIX) as opened:
-        opened.connect(str(held.socket))
-        yield lambda: opened.sendall(hello() + STOP)
+        yield lambda: come(opened, str(held.socket), hello() + STOP)
 
 
 @contextlib.contextmanager
@@ -141,17 +146,16 @@ def unix_open(held: FuzzedService) -> Iterator[Send]:
 @contextlib.contextmanager
 def tcp(held: FuzzedService) -> Iterator[Send]:
     """A connection over TCP that comes with its token and its stop."""
-    with socket.create_connection(("127.0.0.1", held.port)) as opened:
-        yield lambda: opened.sendall(hello(ADMIN_TOKEN) + STOP)
+    with socket.socket() as opened:
+        yield lambda: come(opened, ("127.0.0.1", held.port), hello(ADMIN_TOKEN) + STOP)
 
 
 @contextlib.contextmanager
 def klippy(held: FuzzedService, method: str, params: Mapping[str, str]) -> Iterator[Send]:
-    """A connection of the Klippy API."""
+    """A connection of the Klippy API that comes with its stop."""
     message = json.dumps({"id": 1, "method": method, "params": params}).encode() + b"\x03"
     with socket.socket(socket.AF_UNIX) as opened:
-        opened.connect(str(held.klippy_socket))
-        yield lambda: opened.sendall(message)
+        yield lambda: come(opened, str(held.klippy_socket), message)
 
 
 @contextlib.contextmanager
@@ -212,6 +216,23 @@ def noise(held: FuzzedService, seed: int, found: Found) -> Iterator[None]:
         thread.join()
 
 
+def start_print(held: FuzzedService) -> None:
+    """Print; lines that were typed are done before."""
+    with BlockingClient(str(held.socket)) as client:
+
+        def started() -> bool:
+            try:
+                client.call("job.start", {"file": "long.gcode"})
+            except ApiError as error:
+                if error.code != "busy":
+                    raise
+                return False
+            return True
+
+        held.wait_for(started, "the print begins")
+    held.wait_for(lambda: held.service.moves, "it moves")
+
+
 def stop_again_and_again(held: FuzzedService, minutes: float, found: Found) -> None:
     """Print, stop, restart, for MINUTES."""
     (held.folder / "long.gcode").write_text(PROGRAM, encoding="ascii")
@@ -219,9 +240,7 @@ def stop_again_and_again(held: FuzzedService, minutes: float, found: Found) -> N
     while time.monotonic() < ends_s:
         way, hold = list(WAYS)[turn // 2 % len(WAYS)], turn % 2 == 1
         turn += 1
-        with BlockingClient(str(held.socket)) as client:
-            client.call("job.start", {"file": "long.gcode"})
-        held.wait_for(lambda: held.service.moves, "it moves")
+        start_print(held)
         with WAYS[way](held) as send, held.held() if hold else contextlib.nullcontext():
             found.stops.append(Stop(way, hold, time.monotonic_ns()))
             send()
