@@ -1,18 +1,22 @@
-"""From the emergency stop's last byte to the pin of a virtual node: with the loop free, and held."""
+"""From the emergency stop's last byte to the pin of a virtual node: with the loop free, and held.
 
+The loop is held by a function that waits, and by one that calculates: alone, and with many clients.
+"""
+
+import contextlib
 import json
 import socket
 import statistics
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
-from nodes.virtual.edge_log import EdgeLog
-from nodes.virtual.firmware import firmware_dictionary
-from tests.stages.held_service import NODE, HeldService, serve_held
+from coordinator.ipc.client.blocking import BlockingClient
+from tests.stages.held_service import HeldService, serve_held
 
 ROUNDS = 6
-PIN = "PB2"
+CLIENTS = 100
 STOP = json.dumps({"id": 1, "method": "emergency_stop"}).encode() + b"\x03"
 
 
@@ -26,34 +30,40 @@ def stop(held: HeldService) -> int:
     return sent_ns
 
 
+@contextlib.contextmanager
+def clients(held: HeldService, count: int) -> Iterator[None]:
+    """Have COUNT clients."""
+    with contextlib.ExitStack() as stack:
+        for _ in range(count):
+            stack.enter_context(BlockingClient(str(held.socket)))
+        yield
+
+
 def main() -> None:
-    sent: dict[str, list[int]] = {"the loop is free": [], "the loop is held": []}
-    free, held_ns = sent.values()
+    sent: dict[str, list[int]] = {}
+    machine: list[HeldService] = []
 
     def rounds(held: HeldService) -> None:
         held.ready()
         for _ in range(ROUNDS):
-            free.append(stop(held))
-            held.restart()
-            with held.held():
-                held_ns.append(stop(held))
-            held.restart()
+            for what, count, hold in (
+                ("the loop is free", 0, contextlib.nullcontext()),
+                ("it waits", 0, held.held()),
+                ("it calculates", 0, held.held(calculating=True)),
+                (f"it calculates, {CLIENTS} clients", CLIENTS, held.held(calculating=True)),
+            ):
+                with clients(held, count):
+                    with hold:
+                        sent.setdefault(what, []).append(stop(held))
+                    held.restart()
+        machine.append(held)
 
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        serve_held(folder, rounds)
-        log = EdgeLog(folder / f"{NODE}.edges")
-        pin = firmware_dictionary("canductor-node-toolhead").enumerations["pin"].values[PIN]
-        off = [
-            int(at_ns)
-            for clocks, _, levels in log.edges(pin)
-            for at_ns, level in zip(log.ticks_to_monotonic_ns(clocks), levels, strict=True)
-            if not level
-        ]
+        serve_held(Path(name), rounds)
         for what, times in sent.items():
-            taken_ms = [min(at - sent_ns for at in off if at > sent_ns) / 1e6 for sent_ns in times]
+            taken_ms = machine[0].stopped_after_ms(times)
             print(
-                f"{what:<18} n {len(taken_ms)}, median {statistics.median(taken_ms):6.2f} ms,"
+                f"{what:<26} n {len(taken_ms)}, median {statistics.median(taken_ms):6.2f} ms,"
                 f" worst {max(taken_ms):6.2f} ms"
             )
 

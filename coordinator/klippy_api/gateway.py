@@ -10,7 +10,7 @@ from typing import Any, Final
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.stop_lane import StopLane
-from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
+from coordinator.ipc.server.unix_socket import UnixListener, may_use, peer_of
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
 from coordinator.klippy_api.subscription import Status
@@ -151,7 +151,7 @@ class Gateway:
         log_file: Path | None = None,
     ) -> None:
         self.notice = on_notice
-        self._stop_lane = stop_lane
+        self._stop_lane = stop_lane or StopLane()
         self.endpoints = Endpoints(service, config, self.say, self.registered, log_file)
         service.programs.on_remote = self._call_remote
         self._service = service
@@ -163,8 +163,7 @@ class Gateway:
         self._early: asyncio.Handle | None = None
         self._lines: list[str] = []
         self._starts = service.starts
-        self._server: asyncio.AbstractServer | None = None
-        self._path: Path | None = None
+        self._listener: UnixListener | None = None
         self._scheduler = FairScheduler()
 
     # ------------------------------------------------------------------------------------------- life
@@ -172,12 +171,8 @@ class Gateway:
     async def start(self, path: Path | None) -> None:
         """Serve at PATH (None: at no socket, for clients that are adopted); raises CanductorError."""
         if path is not None:
-            listener = await listen_at(path)
-            self._path = path
-            loop = asyncio.get_running_loop()
-            self._server = await loop.create_unix_server(self.make_connection, sock=listener, backlog=BACKLOG)
-            if self._stop_lane is not None:
-                self._stop_lane.listen(listener, loop, self.make_connection, self._find_stop_of_new)
+            self._listener = UnixListener(self.make_connection, self._stop_lane, self._find_stop_of_new)
+            await self._listener.open(path)
         self._updates = asyncio.get_running_loop().create_task(self._update())
 
     async def close(self) -> None:
@@ -185,15 +180,12 @@ class Gateway:
         if self._updates is not None:
             self._updates.cancel()
             await asyncio.gather(self._updates, return_exceptions=True)
-        if self._server is not None:
-            self._server.close()
+        if self._listener is not None:
+            self._listener.close()
         self._close_all()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        if self._path is not None:
-            with contextlib.suppress(OSError):
-                self._path.unlink()
         await asyncio.sleep(0)
 
     def make_connection(self) -> Connection:
@@ -231,9 +223,13 @@ class Gateway:
 
     def watch_stops(self, connection: Connection, opened: socket.socket | None) -> None:
         """Look for stops in what the socket of CONNECTION has unread, while the loop is held."""
-        if self._stop_lane is not None and opened is not None and connection in self._connections:
-            client = connection.client
-            self._stop_lane.watch(connection, opened, lambda unread: self._find_stop(client, unread))
+        if opened is None:
+            return
+        if connection.transport.is_closing():
+            self._stop_lane.settle(opened)
+            return
+        client = connection.client
+        self._stop_lane.watch(connection, opened, lambda unread: self._find_stop(client, unread))
 
     def _find_stop(self, client: Client, unread: bytes) -> str | None:
         stops = (self.endpoints.stops(request) for request in client.unread_calls(unread))
@@ -245,8 +241,7 @@ class Gateway:
     def forget(self, connection: Connection) -> None:
         """Take note that CONNECTION is over."""
         self._connections.pop(connection, None)
-        if self._stop_lane is not None:
-            self._stop_lane.forget(connection)
+        self._stop_lane.forget(connection)
         self.registered()
 
     def call(self, connection: Connection, request: Request) -> None:

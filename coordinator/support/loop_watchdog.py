@@ -28,6 +28,9 @@ HELD_S: Final = 0.05
 """Nothing may hold the loop for so long; it is reported."""
 REPORT_EVERY_S: Final = 10.0
 """Reports between are left out, and counted."""
+TURN_S: Final = 0.0001
+"""The interpreter's switch interval while the thread works. A loop that calculates takes the interpreter at
+each of the thread's calls of the system; with the usual interval it would give it back after 5 ms."""
 STUCK_S: Final = 2.0
 """A loop that is held for so long may never write its log: the report goes to standard error."""
 FRAMES_MAX: Final = 8
@@ -159,11 +162,15 @@ class LoopWatchdog:
             since_s = self._selector.busy_since_s
             if not since_s:
                 continue
+            usual_s = sys.getswitchinterval()
+            sys.setswitchinterval(TURN_S)
             try:
                 self._while_held()
                 self._look(since_s)
             except Exception:  # noqa: BLE001 (it has to go on: it may be what stops the machine)
                 show_error(traceback.format_exc())
+            finally:
+                sys.setswitchinterval(usual_s)
 
     def _look(self, since_s: float) -> None:
         """Report a hold that began at SINCE_S, once."""

@@ -7,7 +7,7 @@ import pty
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -26,11 +26,13 @@ from coordinator.service.core.machine_service import MachineService, ServiceSett
 from coordinator.service.core.typed import Typed
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.loop_watchdog import WatchedLoop
+from nodes.virtual.edge_log import EdgeLog
+from nodes.virtual.firmware import firmware_dictionary
 from nodes.virtual.plant_page import PlantItemKind, PlantPage
 from tests.stages.real_nodes import CONFIG, real_nodes
 
 MACHINE = Path("config/corexy_toolhead.cfg")
-NODE = "toolhead"
+NODE, FAN_PIN = "toolhead", "PB2"
 PATIENCE_S = 60.0
 """Only for what does not come at all."""
 
@@ -54,6 +56,18 @@ class HeldService:
         """Whether the toolhead's fan is on, by its pin."""
         return PlantPage.at(self.folder, NODE).item(PlantItemKind.FAN, "fan").value > 0
 
+    def stopped_after_ms(self, sent_ns: Sequence[int]) -> list[float]:
+        """Return how long after each of SENT_NS (CLOCK_MONOTONIC) the fan's pin went low."""
+        log = EdgeLog(self.folder / f"{NODE}.edges")
+        pin = firmware_dictionary("canductor-node-toolhead").enumerations["pin"].values[FAN_PIN]
+        off = [
+            int(at_ns)
+            for clocks, _, levels in log.edges(pin)
+            for at_ns, level in zip(log.ticks_to_monotonic_ns(clocks), levels, strict=True)
+            if not level
+        ]
+        return [(min(at for at in off if at > sent) - sent) / 1e6 for sent in sent_ns]
+
     def ready(self) -> None:
         """Wait until the machine is ready, and switch the fan on."""
         self.wait_for(lambda: self.service.state is ServiceState.READY, "it is ready")
@@ -76,15 +90,21 @@ class HeldService:
         self.ready()
 
     @contextmanager
-    def held(self) -> Iterator[None]:
-        """Hold the loop inside."""
+    def held(self, *, calculating: bool = False) -> Iterator[None]:
+        """Hold the loop inside, waiting or CALCULATING, which keeps the interpreter busy, too."""
         begun, over = threading.Event(), threading.Event()
 
-        def hold_the_loop() -> None:
+        def wait() -> None:
             begun.set()
             assert over.wait(PATIENCE_S)
 
-        self.loop.call_soon_threadsafe(hold_the_loop)
+        def calculate() -> None:
+            begun.set()
+            deadline_s = time.monotonic() + PATIENCE_S
+            while not over.is_set():
+                assert time.monotonic() < deadline_s
+
+        self.loop.call_soon_threadsafe(calculate if calculating else wait)
         assert begun.wait(PATIENCE_S)
         try:
             yield

@@ -1,7 +1,6 @@
 """The server's sockets: where it listens, and whom it lets in (asyncio)."""
 
 import asyncio
-import contextlib
 import functools
 import socket
 import ssl
@@ -25,7 +24,7 @@ from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.stop_lane import FindStop, StopLane
 from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, TcpListener
 from coordinator.ipc.server.tls_transport import TlsTransport
-from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
+from coordinator.ipc.server.unix_socket import UnixListener, may_use, peer_of
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
@@ -67,7 +66,7 @@ class IpcServer:
         self._settings = settings
         self._encoder = Encoder()
         self._context = SessionContext(registry, Publisher(state, self._encoder), settings.limits)
-        self._servers: list[asyncio.AbstractServer] = []
+        self._unix: UnixListener | None = None
         self._listener: TcpListener | None = None
         self._connections: set[Connection] = set()
         self._throttle = LoginThrottle()
@@ -76,7 +75,7 @@ class IpcServer:
         self._digests: dict[Connection, bytes] = {}  # digests of the tokens that clients came in with
         self._tcp: set[Connection] = set()
         """Connections that count against ``tcp_connections_max``."""
-        self._stop_lane = stop_lane
+        self._stop_lane = stop_lane or StopLane()
         self._watch: asyncio.Task[None] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._scheduler: FairScheduler | None = None
@@ -113,18 +112,13 @@ class IpcServer:
         """Disconnect every client and close the sockets."""
         if self._watch is not None:
             self._watch.cancel()
-        for server in self._servers:
-            server.close()
-        if self._listener is not None:
-            self._listener.close()
+        for listener in (self._unix, self._listener):
+            if listener is not None:
+                listener.close()
         for connection in list(self._connections):
             connection.session.end(EndReason("closing", "the server is closing"))
             connection.flush()
             connection.transport.close()
-        if self._servers and self._settings.unix_path is not None:
-            with contextlib.suppress(OSError):
-                self._settings.unix_path.unlink()
-        self._servers.clear()
         await asyncio.sleep(0)
 
     def notify(self, event: str, values: Mapping[str, Value]) -> None:
@@ -160,16 +154,10 @@ class IpcServer:
     # ---------------------------------------------------------------------------------------- sockets
 
     async def _open_unix(self, path: Path, scheduler: FairScheduler) -> None:
-        listener = await listen_at(path)
-        loop = asyncio.get_running_loop()
-
-        def make() -> Connection:
-            return Connection(self._admit_unix, self._drop, scheduler)
-
-        server = await loop.create_unix_server(make, sock=listener, backlog=BACKLOG)
-        self._servers.append(server)
-        if self._stop_lane is not None:
-            self._stop_lane.listen(listener, loop, make, self._find_stop)
+        self._unix = UnixListener(
+            lambda: Connection(self._admit_unix, self._drop, scheduler), self._stop_lane, self._find_stop
+        )
+        await self._unix.open(path)
 
     async def _open_tcp(self, tcp: TcpSettings, scheduler: FairScheduler) -> None:
         context = await asyncio.to_thread(_tls_of_tcp, tcp)
@@ -197,10 +185,10 @@ class IpcServer:
     ) -> None:
         """Look for stops of CONNECTION in what TRANSPORT has unread, while the loop is held."""
         opened = None if transport is None else transport.get_extra_info("socket")
-        if self._stop_lane is None or transport is None or opened is None:
+        if opened is None:
             return
         if isinstance(transport, TlsTransport):
-            self._stop_lane.watch_with(connection, functools.partial(transport.find_in, find_stop))
+            self._stop_lane.watch_with(connection, opened, functools.partial(transport.find_in, find_stop))
         else:
             self._stop_lane.watch(connection, opened, find_stop)
 
@@ -383,8 +371,7 @@ class IpcServer:
         self._connections.discard(connection)
         self._tcp.discard(connection)
         self._digests.pop(connection, None)
-        if self._stop_lane is not None:
-            self._stop_lane.forget(connection)
+        self._stop_lane.forget(connection)
         for field in fields(SessionCounters):
             total = getattr(self._closed_totals, field.name) + getattr(
                 connection.session.counters, field.name

@@ -2,121 +2,76 @@
 
 While the loop is held, a thread (support/loop_watchdog.py) looks at what clients have sent without taking
 it, and stops the nodes when there is a stop from one who may stop them. The loop reads the same bytes when it
-can, and answers them: that changes nothing any more. Sockets that accept connections are looked at, too,
+can, and answers them: that changes nothing any more. Connections are accepted meanwhile, too (acceptor.py),
 because ``canductor estop`` comes with a new one.
 """
 
-import asyncio
 import contextlib
 import functools
 import os
 import socket
 import threading
+from asyncio.trsock import TransportSocket
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
 from typing import Final
 
 FindStop = Callable[[bytes], str | None]
 """Returns who stops the machine with bytes that are unread; None: nobody does. In any thread."""
 Finder = Callable[[], str | None]
 PEEK_BYTES: Final = 262_144
-ACCEPTED_MAX: Final = 64
-"""Connections that are accepted during one hold; others wait for the loop."""
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """A connection that was accepted during a hold."""
-
-    find: Finder
-    serve: Callable[[], None]
-    """Let the loop serve it; called on the loop."""
-    close: Callable[[], None]
-
-
-@dataclass(frozen=True, slots=True)
-class _Listener:
-    listening: socket.socket
-    loop: asyncio.AbstractEventLoop
-    arrive: Callable[[socket.socket], Arrival]
+def _ignore(_: str) -> None:
+    pass
 
 
 class StopLane:
     """Looks at what is unread; STOP is called with who stops the machine, in the lane's thread."""
 
-    def __init__(self, stop: Callable[[str], None]) -> None:
+    def __init__(self, stop: Callable[[str], None] = _ignore) -> None:
         self._stop = stop
         self._lock = threading.Lock()
         self._unread: dict[Hashable, Finder] = {}
+        self._new: dict[int, Finder] = {}
+        """Of connections without a protocol, by the number of their file."""
         self._peeking: dict[Hashable, socket.socket] = {}
         self._finders: list[Finder] = []
-        self._listeners: list[_Listener] = []
-        self._accepted: list[Arrival] = []
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._accepting: dict[Hashable, Callable[[], None]] = {}
 
     # ---- On the loop ----
 
-    def watch(self, key: Hashable, connection: socket.socket, find_stop: FindStop) -> None:
-        """Look at what CONNECTION has unread, with FIND_STOP, until ``forget`` of KEY."""
+    def watch(self, key: Hashable, opened: socket.socket | TransportSocket, find_stop: FindStop) -> None:
+        """Look at what OPENED has unread, with FIND_STOP, until ``forget`` of KEY; it is not new any more."""
         with contextlib.suppress(OSError):  # it has closed already
-            own = socket.socket(fileno=os.dup(connection.fileno()))
+            own = socket.socket(fileno=os.dup(opened.fileno()))
             with self._lock:
                 self._peeking[key] = own
                 self._unread[key] = functools.partial(find_unread, own, find_stop)
+        self.settle(opened)
 
-    def watch_with(self, key: Hashable, find: Finder) -> None:
-        """Ask FIND, until ``forget`` of KEY: what is unread cannot be peeked at."""
+    def watch_with(self, key: Hashable, opened: socket.socket | TransportSocket, find: Finder) -> None:
+        """Ask FIND about OPENED, until ``forget`` of KEY; it is not new any more."""
         with self._lock:
             self._unread[key] = find
+            self._new.pop(opened.fileno(), None)
 
     def forget(self, key: Hashable) -> None:
-        """Look at it no more; without effect for an unknown KEY."""
+        """Look at it no more, or listen there no more; without effect for an unknown KEY."""
         with self._lock:
             self._unread.pop(key, None)
+            self._accepting.pop(key, None)
             if (own := self._peeking.pop(key, None)) is not None:
                 own.close()
 
-    def listen(
-        self,
-        listener: socket.socket,
-        loop: asyncio.AbstractEventLoop,
-        make: Callable[[], asyncio.BaseProtocol],
-        find_stop: Callable[[socket.socket, bytes], str | None],
-    ) -> None:
-        """Accept what waits at LISTENER during a hold, and look at it; LOOP serves it later, as MAKE says.
-
-        FIND_STOP is for a connection that nobody has read from.
-        """
-
-        def arrive(accepted: socket.socket) -> Arrival:
-            find = functools.partial(find_stop, accepted)
-            return Arrival(
-                functools.partial(find_unread, accepted, find),
-                functools.partial(self._serve, loop, make, accepted),
-                accepted.close,
-            )
-
-        self.listen_with(listener, loop, arrive)
-
-    def listen_with(
-        self,
-        listener: socket.socket,
-        loop: asyncio.AbstractEventLoop,
-        arrive: Callable[[socket.socket], Arrival],
-    ) -> None:
-        """Accept what waits at LISTENER during a hold; ARRIVE says, in that thread, what to do with it."""
+    def settle(self, opened: socket.socket | TransportSocket) -> None:
+        """Look no more at the new connection OPENED: it is about to be closed."""
         with self._lock:
-            self._listeners.append(_Listener(listener, loop, arrive))
+            self._new.pop(opened.fileno(), None)
 
-    def _serve(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        make: Callable[[], asyncio.BaseProtocol],
-        accepted: socket.socket,
-    ) -> None:
-        task = loop.create_task(_connect(loop, make, accepted))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+    def listen(self, key: Hashable, accept: Callable[[], None]) -> None:
+        """Call ACCEPT at each look, until ``forget`` of KEY: it takes new connections."""
+        with self._lock:
+            self._accepting[key] = accept
 
     def look_also(self, find: Finder) -> None:
         """Ask FIND as well: it looks where there is no socket."""
@@ -128,49 +83,33 @@ class StopLane:
         with self._lock:
             for own in self._peeking.values():
                 own.close()
-            for arrival in self._accepted:
-                arrival.close()
             self._unread.clear()
+            self._new.clear()
             self._peeking.clear()
-            self._accepted.clear()
-            self._listeners.clear()
+            self._accepting.clear()
             self._finders.clear()
+
+    # ---- On the loop, or in the lane's thread ----
+
+    def watch_new(self, opened: socket.socket, find: Finder) -> None:
+        """Ask FIND about OPENED, just accepted, until it is watched under a key, or ``settle``."""
+        with self._lock:
+            self._new[opened.fileno()] = find
 
     # ---- In the lane's thread ----
 
     def look(self) -> None:
         """Look at everything once."""
         with self._lock:
-            self._accept()
-            accepted = [arrival.find for arrival in self._accepted]
-            found = [find() for find in (*self._finders, *self._unread.values(), *accepted)]
+            accepting = list(self._accepting.values())
+        for accept in accepting:
+            accept()
+        with self._lock:
+            found = [find() for find in (*self._finders, *self._unread.values(), *self._new.values())]
         for who in found:
             if who is not None:
                 self._stop(who)
                 return
-
-    def _accept(self) -> None:
-        for listener in self._listeners:
-            while len(self._accepted) < ACCEPTED_MAX:
-                try:
-                    accepted, _ = listener.listening.accept()
-                except OSError:
-                    break
-                accepted.setblocking(False)
-                arrival = listener.arrive(accepted)
-                self._accepted.append(arrival)
-                try:
-                    listener.loop.call_soon_threadsafe(self._hand_over, arrival)
-                except RuntimeError:  # the loop has ended
-                    arrival.close()
-
-    def _hand_over(self, arrival: Arrival) -> None:
-        """Have the loop serve it, and look at it no more, unless the loop says so: on the loop."""
-        with self._lock:
-            if arrival not in self._accepted:
-                return  # the lane was closed
-            self._accepted.remove(arrival)
-        arrival.serve()
 
 
 def find_unread(opened: socket.socket, find_stop: FindStop) -> str | None:
@@ -180,12 +119,3 @@ def find_unread(opened: socket.socket, find_stop: FindStop) -> str | None:
     except OSError:
         data = b""
     return find_stop(data)
-
-
-async def _connect(
-    loop: asyncio.AbstractEventLoop, make: Callable[[], asyncio.BaseProtocol], accepted: socket.socket
-) -> None:
-    try:
-        await loop.connect_accepted_socket(make, accepted)
-    except OSError:  # it has left
-        accepted.close()

@@ -17,12 +17,16 @@ WAITING_MAX: Final = 262_144
 """Decrypted bytes that wait to be taken; then no more are read."""
 
 
+def _nothing() -> None:
+    pass
+
+
 class TlsState:
     """The server's end of a TLS connection over OPENED, a non-blocking socket of its own; for any thread."""
 
     def __init__(self, opened: socket.socket, context: ssl.SSLContext) -> None:
         self.socket = opened
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
         self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=True)
         self._waiting = bytearray()
@@ -32,6 +36,25 @@ class TlsState:
         """Why nothing more will come, unless the client has ended it."""
         self.ended = False
         """Whether nothing more will come."""
+        self._raw: asyncio.Transport | None = None
+        self._on_news = _nothing
+
+    def carried_by(self, raw: asyncio.Transport, on_news: Callable[[], None]) -> None:
+        """Have RAW send, from now on; ON_NEWS is called when ``find_in`` has taken something."""
+        with self._lock:
+            self._raw, self._on_news = raw, on_news
+
+    def find_in(self, find: Callable[[bytes], str | None]) -> str | None:
+        """Return what FIND finds in what the client has sent and nobody has taken; beside the loop."""
+        with self._lock:
+            shakes_hands = not self.is_ready
+            news = self.receive()
+            if news and shakes_hands and (self._raw is None or not self._raw.get_write_buffer_size()):
+                with contextlib.suppress(OSError):
+                    self.socket.sendall(self._outgoing.read())  # of the handshake: there is room for it
+        if news:
+            self._on_news()
+        return find(self.waiting)
 
     def receive(self) -> bool:
         """Take a bounded part of what the socket has, and decrypt it; return whether there was news."""
@@ -105,10 +128,11 @@ class TlsState:
         with self._lock:
             self.socket.close()
 
-    def outgoing(self) -> bytes:
-        """Return what is to be sent, once."""
+    def send(self) -> None:
+        """Send what is to be sent; on the loop."""
         with self._lock:
-            return self._outgoing.read()
+            if self._raw is not None and (data := self._outgoing.read()):
+                self._raw.write(data)
 
 
 class TlsTransport(asyncio.Transport):
@@ -136,10 +160,11 @@ class TlsTransport(asyncio.Transport):
 
     def find_in(self, find: Callable[[bytes], str | None]) -> str | None:
         """Return what FIND finds in what the client has sent and nobody has taken; in any thread."""
-        if self._state.receive():
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                self._loop.call_soon_threadsafe(self._deliver)
-        return find(self._state.waiting)
+        return self._state.find_in(find)
+
+    def _handle_news(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._deliver)
 
     # ----------------------------------------------------------------------------- what carries it
 
@@ -147,6 +172,7 @@ class TlsTransport(asyncio.Transport):
         """Begin: RAW sends what is encrypted; what comes is read here."""
         raw.pause_reading()
         self._raw = raw
+        self._state.carried_by(raw, self._handle_news)
         self._loop.add_reader(self._state.socket, self._readable)
         self._deliver()  # of the handshake, where it has begun
 
@@ -172,7 +198,7 @@ class TlsTransport(asyncio.Transport):
         """Let the protocol have what has come."""
         if self._closing:
             return
-        self._send()
+        self._state.send()
         if self._state.is_ready and self._protocol is None:
             self._protocol = self._make_protocol()
             self._protocol.connection_made(self)
@@ -184,10 +210,6 @@ class TlsTransport(asyncio.Transport):
             if self._state.error is None:
                 _say_end(self._protocol)
             self.close()
-
-    def _send(self) -> None:
-        if data := self._state.outgoing():
-            self._raw.write(data)
 
     # ------------------------------------------------------------------------------- asyncio.Transport
 
@@ -234,7 +256,7 @@ class TlsTransport(asyncio.Transport):
         except OSError:  # nothing can be said to this client any more
             self.abort()
             return
-        self._send()
+        self._state.send()
 
     def can_write_eof(self) -> bool:
         """Return that TLS is ended as a whole."""
@@ -258,7 +280,7 @@ class TlsTransport(asyncio.Transport):
             self._closing = True
             self._read_no_more()
             self._state.close()
-            self._send()
+            self._state.send()
             self._raw.close()
 
     def abort(self) -> None:
@@ -295,15 +317,15 @@ async def serve_tls(
     opened: socket.socket,
     context: ssl.SSLContext,
     handshake_s: float,
-    state: TlsState | None = None,
+    state: TlsState,
 ) -> None:
     """Have the running loop serve OPENED, accepted; return when the handshake is done, in HANDSHAKE_S.
 
-    STATE: where TLS has begun already, with a socket of its own. Raises OSError, TimeoutError included, with
-    the connection closed.
+    STATE is that of TLS, with a socket of its own. Raises OSError, TimeoutError included, with the connection
+    closed.
     """
     loop = asyncio.get_running_loop()
-    transport = TlsTransport(loop, state or TlsState(opened.dup(), context), make_protocol, context)
+    transport = TlsTransport(loop, state, make_protocol, context)
     raw, _ = await loop.connect_accepted_socket(lambda: _Carrier(transport), opened)
     try:
         async with asyncio.timeout(handshake_s):

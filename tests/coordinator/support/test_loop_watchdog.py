@@ -2,11 +2,14 @@
 
 import asyncio
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
 
-from coordinator.support.loop_watchdog import HELD_S, LoopWatchdog, WatchedLoop
+import pytest
+
+from coordinator.support.loop_watchdog import HELD_S, TURN_S, LoopWatchdog, WatchedLoop
 
 PATIENCE_S = 60.0
 
@@ -63,6 +66,16 @@ def test_who_holds_the_loop_is_named_and_others_are_counted() -> None:
     assert "main (" not in report, "nor who runs the loop"
     assert "it calculated for " in report
     assert threading.get_ident() not in watched.threads
+
+
+def test_a_loop_that_calculates_gives_the_thread_its_turns() -> None:
+    """Failed before: each call of the system cost the thread 5 ms, and it makes one for each client."""
+    watched, intervals_s = Watched(), set[float]()
+    usual_s = sys.getswitchinterval()
+    watched.looks = lambda: intervals_s.add(sys.getswitchinterval())
+    watched.run(watched.hold_the_loop)
+    assert max(intervals_s) == pytest.approx(TURN_S)
+    assert sys.getswitchinterval() == usual_s, "the rest of the program keeps its own"
 
 
 def test_signals_that_wait_are_seen_while_the_loop_is_held() -> None:

@@ -258,6 +258,73 @@ def test_a_new_connection_over_tcp(
     run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, chosen))
 
 
+ROUNDS = pytest.mark.parametrize("rounds", range(8))
+"""Of the loop between a connection and the hold: it is accepted, gets a transport, a protocol, is read."""
+
+
+@ROUNDS
+def test_a_new_connection_that_the_loop_has_begun_to_take(tmp_path: Path, rounds: int) -> None:
+    """Failed before: what was accepted was looked at only when its protocol was there."""
+    lane = Lane()
+
+    async def go(served: Served) -> None:
+        with socket.socket(socket.AF_UNIX) as opened:
+            opened.connect(served.at)
+            opened.sendall(line(HELLO))
+            for _ in range(rounds):
+                await asyncio.sleep(0)
+            opened.sendall(line(STOP))
+            assert lane.seen() == ["me"]
+            assert served.stops == []
+            while not served.stops:  # noqa: ASYNC110 (it tells nobody)
+                await asyncio.sleep(0)
+
+    run(tmp_path, go, stop_lane=lane)
+
+
+@ROUNDS
+@TLS
+def test_a_new_connection_over_tcp_that_the_loop_has_begun_to_take(
+    tmp_path: Path, certificate: tuple[Path, Path], rounds: int, *, secret: bool
+) -> None:
+    """Failed before, likewise; handshakes that the loop had begun waited for it."""
+    lane, chosen = Lane(), certificate if secret else None
+    hello = line({**HELLO, "params": {"version": 1, "token": TOKENS[Scope.OPERATE]}})
+
+    async def go(served: Served) -> None:
+        dialled = Dialled(served.server.tcp_port or 0, chosen)
+        done = dialled.shake_hands()
+        for _ in range(rounds):
+            await asyncio.sleep(0)
+        while not done:
+            assert lane.seen() == []
+            done = dialled.shake_hands()
+        dialled.send(hello + line(STOP))
+        assert lane.sees(["me"])
+        while not served.stops:  # noqa: ASYNC110 (it tells nobody)
+            await asyncio.sleep(0)
+        dialled.close()
+        await served.server_has(0)
+
+    run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, chosen))
+
+
+def test_what_is_given_up_is_not_looked_at(tmp_path: Path) -> None:
+    lane = Lane()
+
+    async def go(served: Served) -> None:
+        new = [socket.create_connection(("127.0.0.1", served.server.tcp_port or 0)) for _ in range(40)]
+        for opened in new[:20]:
+            opened.close()
+        assert lane.seen() == []
+        for opened in new[20:]:
+            opened.close()
+        while served.server.figures()["connections"] or lane._new or lane._unread:  # noqa: ASYNC110
+            await asyncio.sleep(0)
+
+    run(tmp_path, go, stop_lane=lane, tcp=plain_tcp(tmp_path), tcp_connections_max=4)
+
+
 def test_a_connection_with_tls_that_exists(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
     lane = Lane()
 
