@@ -22,8 +22,8 @@ from nodes.support.terminal import show_error
 
 LOOK_S: Final = 0.02
 """From so long on, a loop that is still at work is looked at."""
-AGAIN_S: Final = 0.01
-"""Between further looks."""
+AGAIN_S: Final = 0.005
+"""Between further looks; a TLS handshake takes three of them."""
 HELD_S: Final = 0.05
 """Nothing may hold the loop for so long; it is reported."""
 REPORT_EVERY_S: Final = 10.0

@@ -2,52 +2,50 @@
 
 Usage, from the project's root: python -m tests.fuzz.live_stops [--minutes M] [--seed N]
 
-A service on virtual nodes prints. All the time clients that are random, wrong, slow or rude come and go
-on the Unix socket and TCP (live_visits.py), and random bytes come on the Klippy API's socket and at the
-terminal. Every few seconds, as fast as the machine restarts and moves again, an emergency stop is sent by
-the next way in, by turns while the control loop is free and while it is held; a plain restart follows.
-Each time is from before the stop's last bytes are sent to the edge of the node's pin. A stop that has no
-effect, names another cause, or a restart that fails ends the program with status 1; times are printed
-beside their bounds, for a busy computer may be late itself.
+A service on virtual nodes prints, in a process of its own (stopped_service.py). All the time clients that are
+random, wrong, slow or rude come and go on the Unix socket and TCP (live_visits.py), and random bytes come on
+all other ways in (live_noise.py). As fast as the machine restarts and moves again, an emergency stop is sent
+by the next way in, by turns while the control loop is free, while it is held by what waits, and while it is
+held by what calculates; a plain restart follows. Each time is from before the stop's last bytes are sent to
+the edge of the node's pin. It ends with status 1 when a stop has no effect, comes later than its bound or
+does not name who stopped, or when a restart fails. Run it on a computer that does nothing else.
 """
 
 import argparse
+import asyncio
 import contextlib
 import json
 import os
-import random
+import pty
 import socket
+import ssl
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
+
+import aiohttp
 
 from coordinator.ipc.client.blocking import BlockingClient
-from coordinator.ipc.protocol.limits import Limits
-from coordinator.ipc.protocol.methods import ApiError, Registry, Scope
-from coordinator.ipc.server.server import IpcServer
-from coordinator.ipc.server.settings import IpcSettings, TcpSettings
-from coordinator.service.api.methods import add_methods
-from nodes.virtual.edge_log import EdgeLog
-from nodes.virtual.firmware import firmware_dictionary
+from coordinator.ipc.protocol.methods import ApiError
 from tests.fuzz.ipc_target import line
 from tests.fuzz.live import ROOT
+from tests.fuzz.live_noise import TERMINAL_FD
 from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
-from tests.stages.held_service import NODE, HeldService, serve_held
+from tests.stages.held_service import fan_turns, stopped_after_ms
 
-PIN: Final = "PB2"
-FREE_MS, HELD_MS = 10.0, 50.0
-"""Bounds of the time to the node's pin, with the loop free and held."""
-NOISE_S: Final = 0.02
-"""Between two bursts of random bytes."""
+BOUNDS_MS: Final = {"free": 10.0, "held": 50.0, "calculating": 50.0}
+"""Of the time to the node's pin, by the state of the loop."""
+OWN_ADDRESS: Final = "127.0.0.9"
+"""From here stops come over TCP: wrong tokens lock the fuzzers' addresses out."""
+PATIENCE_S: Final = 60.0
+LOOK_S: Final = 0.005
 PROGRAM: Final = "SET_KINEMATIC_POSITION X=100 Y=100 Z=10\n" + "G1 X20 F3000\nG1 X180\n" * 500
 
 
@@ -56,7 +54,8 @@ class Stop:
     """One emergency stop."""
 
     way: str
-    held: bool
+    loop: str
+    """Its state, as in ``BOUNDS_MS``."""
     sent_ns: int
     """CLOCK_MONOTONIC."""
 
@@ -70,39 +69,90 @@ class Found:
     counts: Counter[str] = field(default_factory=Counter)
 
 
-class FuzzedService(HeldService):
-    """Also lets in whoever comes, to watch."""
+class Machine:
+    """The machine in FOLDER, and its operator; a context manager."""
 
-    port: int
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.terminal = -1
+        """Where a user types."""
+        self.ways: dict[str, Any] = {}
+        """As stopped_service.py prints them."""
+        self.browser: Browser
+        self.operator: BlockingClient
+        self._process: subprocess.Popen[str]
+        self._stack = contextlib.ExitStack()
 
-    @asynccontextmanager
-    async def interfaces(self) -> AsyncIterator[None]:
-        """Serve on all ways in."""
-        tokens = self.folder / "tokens"
-        tokens.touch(0o600)
-        tokens.write_text(f"watch fuzzer {WATCH_TOKEN}\nadmin operator {ADMIN_TOKEN}\n")
-        settings = IpcSettings(
-            unix_path=self.open_socket,
-            unix_scope=Scope.WATCH,
-            tcp=TcpSettings(host="127.0.0.1", port=0, tokens=tokens, plain_on_loopback=True),
-            limits=Limits(message_timeout_s=1.0),
-        )
-        async with super().interfaces():
-            registry = Registry()
-            add_methods(self.service, registry)
-            server = IpcServer(registry, self.tree, settings, stop_lane=self.stop_path.lane)
-            await server.start()
-            assert server.tcp_port is not None
-            self.port = server.tcp_port
-            try:
-                yield
-            finally:
-                await server.close()
+    def __enter__(self) -> Self:
+        self.terminal, theirs = pty.openpty()
+        self._stack.callback(os.close, self.terminal)
+        command = [sys.executable, "-m", "tests.fuzz.stopped_service", str(self.folder)]
+        self._process = self._stack.enter_context(with_terminal(command, theirs))
+        self._stack.callback(self._process.communicate)
+        os.close(theirs)
+        self.ways = json.loads(self._answer())
+        self.operator = self._stack.enter_context(BlockingClient(str(self.folder / "api.sock")))
+        self.browser = self._stack.enter_context(Browser(self.ways["pages"]))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    def _answer(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline()
+
+    def _tell(self, line: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+
+    @contextlib.contextmanager
+    def loop(self, state: str) -> Iterator[None]:
+        """Have the control loop be in STATE inside."""
+        if state == "free":
+            yield
+            return
+        self._tell("waiting" if state == "held" else state)
+        assert self._answer() == "held\n"
+        try:
+            yield
+        finally:
+            self._tell("free")
 
     @property
-    def open_socket(self) -> Path:
-        """Who comes here may watch."""
-        return self.folder / "open.sock"
+    def state(self) -> dict[str, str]:
+        """The machine's state and its cause."""
+        found: dict[str, str] = self.operator.call("machine.state")
+        return found
+
+    def wait_for(self, true: Callable[[], bool], what: str) -> None:
+        """Wait until TRUE."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not true():
+            if time.monotonic() > deadline_s:
+                raise TimeoutError(f"no end of waiting until {what}; the machine: {self.state}")
+            time.sleep(LOOK_S)
+
+    def begin(self) -> None:
+        """Wait until it is ready, switch the fan on, and print; lines that were typed are done first."""
+        self.wait_for(lambda: self.state["state"] == "ready", "it is ready")
+        for method, params in (("gcode.run", {"script": "M106 S255"}), ("job.start", {"file": "long.gcode"})):
+            self.wait_for(lambda: self._is_done(method, params), f"{method} is done")  # noqa: B023 (at once)
+        self.wait_for(lambda: fan_turns(self.folder), "the fan turns")
+
+    def _is_done(self, method: str, params: Mapping[str, str]) -> bool:
+        try:
+            self.operator.call(method, params)
+        except ApiError as error:
+            if error.code != "busy":
+                raise
+            return False
+        return True
+
+    def restart(self) -> None:
+        """Start it again, plainly, after a stop."""
+        self.operator.call("machine.restart")
 
 
 # ------------------------------------------------------------------------------------------ ways to stop
@@ -117,7 +167,9 @@ def hello(token: str | None = None) -> bytes:
     return line({"id": 1, "method": "api.hello", "params": params})
 
 
-STOP: Final = line({"id": 2, "method": "machine.emergency_stop", "params": {}})
+def stop_of(who: str) -> dict[str, Any]:
+    """Return the request with which WHO stops the machine."""
+    return {"id": 2, "method": "machine.emergency_stop", "params": {"who": who}}
 
 
 def come(opened: socket.socket, address: str | tuple[str, int], data: bytes) -> None:
@@ -127,179 +179,245 @@ def come(opened: socket.socket, address: str | tuple[str, int], data: bytes) -> 
 
 
 @contextlib.contextmanager
-def unix(held: FuzzedService) -> Iterator[Send]:
+def unix(machine: Machine, who: str) -> Iterator[Send]:
     """A connection to the Unix socket that comes with its stop."""
     with socket.socket(socket.AF_UNIX) as opened:
-        yield lambda: come(opened, str(held.socket), hello() + STOP)
+        yield lambda: come(opened, str(machine.folder / "api.sock"), hello() + line(stop_of(who)))
 
 
 @contextlib.contextmanager
-def unix_open(held: FuzzedService) -> Iterator[Send]:
+def unix_open(machine: Machine, who: str) -> Iterator[Send]:
     """A connection to the Unix socket that is served already."""
     with socket.socket(socket.AF_UNIX) as opened:
-        opened.connect(str(held.socket))
-        opened.sendall(hello())
+        come(opened, str(machine.folder / "api.sock"), hello())
         assert opened.recv(1 << 16)
-        yield lambda: opened.sendall(STOP)
+        yield lambda: opened.sendall(line(stop_of(who)))
 
 
 @contextlib.contextmanager
-def tcp(held: FuzzedService) -> Iterator[Send]:
+def tcp(machine: Machine, who: str) -> Iterator[Send]:
     """A connection over TCP that comes with its token and its stop."""
     with socket.socket() as opened:
-        yield lambda: come(opened, ("127.0.0.1", held.port), hello(ADMIN_TOKEN) + STOP)
+        opened.bind((OWN_ADDRESS, 0))
+        data = hello(ADMIN_TOKEN) + line(stop_of(who))
+        yield lambda: come(opened, ("127.0.0.1", machine.ways["tcp"]), data)
+
+
+def untrusting() -> ssl.SSLContext:
+    """Return TLS with whatever certificate."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    return context
 
 
 @contextlib.contextmanager
-def klippy(held: FuzzedService, method: str, params: Mapping[str, str]) -> Iterator[Send]:
+def tls(machine: Machine, who: str, *, is_new: bool) -> Iterator[Send]:
+    """A connection over TCP with TLS; one that IS_NEW shakes hands only with its stop."""
+    data = hello(ADMIN_TOKEN), line(stop_of(who))
+    with socket.socket() as plain:
+        plain.bind((OWN_ADDRESS, 0))
+        with untrusting().wrap_socket(plain, do_handshake_on_connect=True) as opened:
+            address = ("127.0.0.1", machine.ways["tls"])
+            if is_new:
+                yield lambda: come(opened, address, b"".join(data))
+            else:
+                come(opened, address, data[0])
+                assert opened.recv(1 << 16)
+                yield lambda: opened.sendall(data[1])
+
+
+class Browser:
+    """Is signed in to PAGES, by one link each; a context manager."""
+
+    def __init__(self, pages: Sequence[str]) -> None:
+        self._pages = [tuple(link.split("/#")) for link in pages]
+        self._keys: list[str] = []
+        self._runner = asyncio.Runner()
+        self._http: list[aiohttp.ClientSession] = []
+
+    def __enter__(self) -> Self:
+        self._runner.run(self._sign_in())
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for http in self._http:
+            self._runner.run(http.close())
+        self._runner.close()
+
+    async def _sign_in(self) -> None:
+        for page, code in self._pages:
+            connector = aiohttp.TCPConnector(ssl=False, local_addr=(OWN_ADDRESS, 0))
+            http = aiohttp.ClientSession(connector=connector, cookie_jar=aiohttp.CookieJar(unsafe=True))
+            self._http.append(http)
+            asked = {"token": code, "keep": True}
+            async with http.post(f"{page}/login", json=asked, headers={"Origin": page}) as answer:
+                self._keys.append((await answer.json())["key"])
+
+    @contextlib.contextmanager
+    def stopping(self, number: int, who: str) -> Iterator[Send]:
+        """The page with that NUMBER, open."""
+        page, key = self._pages[number][0], self._keys[number]
+
+        async def opened() -> aiohttp.ClientWebSocketResponse:
+            shown = await self._http[number].ws_connect(f"{page}/socket", headers={"Origin": page})
+            params = {"version": 1, "client": "the page", "token": key}
+            await shown.send_str(json.dumps({"id": 1, "method": "api.hello", "params": params}))
+            assert "result" in json.loads((await shown.receive()).data)
+            return shown
+
+        shown = self._runner.run(opened())
+        yield lambda: self._runner.run(shown.send_str(json.dumps(stop_of(who))))
+        self._runner.run(shown.close())
+
+
+@contextlib.contextmanager
+def klippy(machine: Machine, method: str, params: Mapping[str, str]) -> Iterator[Send]:
     """A connection of the Klippy API that comes with its stop."""
     message = json.dumps({"id": 1, "method": method, "params": params}).encode() + b"\x03"
     with socket.socket(socket.AF_UNIX) as opened:
-        yield lambda: come(opened, str(held.klippy_socket), message)
+        yield lambda: come(opened, str(machine.folder / "klippy.sock"), message)
 
 
 @contextlib.contextmanager
-def typed(held: FuzzedService) -> Iterator[Send]:
+def typed(machine: Machine) -> Iterator[Send]:
     """A line at the terminal."""
-    yield lambda: os.write(held.terminal, b"\nM112\n")
+    yield lambda: os.write(machine.terminal, b"\nM112\n")
 
 
-WAYS: Final[Mapping[str, Callable[[FuzzedService], contextlib.AbstractContextManager[Send]]]] = {
-    "Unix socket, new": unix,
-    "Unix socket, open": unix_open,
-    "TCP, new": tcp,
-    "Klippy API, emergency_stop": lambda held: klippy(held, "emergency_stop", {}),
-    "Klippy API, M112": lambda held: klippy(held, "gcode/script", {"script": "M112"}),
-    "terminal, M112": typed,
+@contextlib.contextmanager
+def serial(machine: Machine) -> Iterator[Send]:
+    """A line of a serial host."""
+    opened = os.open(machine.folder / "host.pty", os.O_WRONLY | os.O_NOCTTY)
+    try:
+        yield lambda: os.write(opened, b"\nM112\n")
+    finally:
+        os.close(opened)
+
+
+WHO: Final = "stop number {}"
+Way = Callable[[Machine, str], contextlib.AbstractContextManager[Send]]
+"""Gets who stops."""
+WAYS: Final[Mapping[str, tuple[str, Way]]] = {
+    "Unix socket, new": (WHO, unix),
+    "Unix socket, open": (WHO, unix_open),
+    "TCP, new": (WHO, tcp),
+    "TLS, new": (WHO, lambda machine, who: tls(machine, who, is_new=True)),
+    "TLS, open": (WHO, lambda machine, who: tls(machine, who, is_new=False)),
+    "page": (WHO, lambda machine, who: machine.browser.stopping(0, who)),
+    "page with TLS": (WHO, lambda machine, who: machine.browser.stopping(1, who)),
+    "Klippy API, emergency_stop": (
+        "by a client of the Klippy API",
+        lambda machine, _: klippy(machine, "emergency_stop", {}),
+    ),
+    "Klippy API, M112": (
+        "M112 of a client of the Klippy API",
+        lambda machine, _: klippy(machine, "gcode/script", {"script": "M112"}),
+    ),
+    "terminal, M112": ("M112 of a client", lambda machine, _: typed(machine)),
+    "serial host, M112": ("M112 of the serial host", lambda machine, _: serial(machine)),
 }
+"""Whom the cause must name, and how it is done."""
 
 
 # --------------------------------------------------------------------------------------------- the fuzzing
 
 
+def with_terminal(command: Sequence[str], terminal: int) -> subprocess.Popen[str]:
+    """Begin COMMAND in a process with TERMINAL as descriptor 3."""
+
+    def give() -> None:
+        os.dup2(terminal, TERMINAL_FD)
+
+    return subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        pass_fds=(TERMINAL_FD,),
+        preexec_fn=give,  # noqa: PLW1509 (no thread holds a lock that it needs)
+    )
+
+
 @contextlib.contextmanager
-def visitors(held: FuzzedService, seed: int, found: Found) -> Iterator[None]:
-    """Have clients of live_visits.py come and go, in a process of their own."""
-    command = [sys.executable, "-m", "tests.fuzz.live_visits", str(held.open_socket), str(held.port)]
-    with subprocess.Popen(
-        [*command, WATCH_TOKEN, str(seed)], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
+def visitors(machine: Machine, seed: int, found: Found) -> Iterator[None]:
+    """Have clients of live_visits.py come and go, and noise on all other ways."""
+    ports = [page.split("/#")[0].rpartition(":")[2] for page in machine.ways["pages"]]
+    visits = [str(machine.folder / "open.sock"), str(machine.ways["tcp"]), WATCH_TOKEN]
+    noise = [str(machine.folder), ",".join(ports), str(machine.ways["tls"]), str(machine.ways["metrics"])]
+    with contextlib.ExitStack() as stack:
+        running = {
+            name: stack.enter_context(
+                with_terminal(
+                    [sys.executable, "-m", f"tests.fuzz.{name}", *given, str(seed)], machine.terminal
+                )
+            )
+            for name, given in (("live_visits", visits), ("live_noise", noise))
+        }
         try:
             yield
         finally:
-            told = json.loads(process.communicate()[0])
-            found.counts.update(told["counts"])
-            found.problems += told["problems"]
+            visited = json.loads(running["live_visits"].communicate()[0])
+            found.counts.update(visited["counts"])
+            found.problems += visited["problems"]
+            made = json.loads(running["live_noise"].communicate()[0])
+            found.counts.update({f"noise: {way}": count for way, count in made.items()})
 
 
-@contextlib.contextmanager
-def noise(held: FuzzedService, seed: int, found: Found) -> Iterator[None]:
-    """Send random bytes to the Klippy API's socket and to the terminal."""
-    chance, over = random.Random(seed), threading.Event()
-
-    def make() -> None:
-        while not over.wait(NOISE_S):
-            with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as opened:  # it is cut off
-                opened.settimeout(1.0)
-                opened.connect(str(held.klippy_socket))
-                opened.sendall(chance.randbytes(chance.randrange(1, 3000)) + b"\x03")
-            text = bytes(chance.choices(b"abcxyz0189 =;#(\t\x00\x7f\xc3\n", k=chance.randrange(1, 80)))
-            os.write(held.terminal, text + b"\n")
-            found.counts["bursts of noise"] += 1
-
-    thread = threading.Thread(target=make, name="noise")
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
-
-
-def start_print(held: FuzzedService) -> None:
-    """Print; lines that were typed are done before."""
-    with BlockingClient(str(held.socket)) as client:
-
-        def started() -> bool:
-            try:
-                client.call("job.start", {"file": "long.gcode"})
-            except ApiError as error:
-                if error.code != "busy":
-                    raise
-                return False
-            return True
-
-        held.wait_for(started, "the print begins")
-    held.wait_for(lambda: held.service.moves, "it moves")
-
-
-def stop_again_and_again(held: FuzzedService, minutes: float, found: Found) -> None:
+def stop_again_and_again(machine: Machine, minutes: float, found: Found) -> None:
     """Print, stop, restart, for MINUTES."""
-    (held.folder / "long.gcode").write_text(PROGRAM, encoding="ascii")
+    (machine.folder / "long.gcode").write_text(PROGRAM, encoding="ascii")
     ends_s, turn = time.monotonic() + 60 * minutes, 0
     while time.monotonic() < ends_s:
-        way, hold = list(WAYS)[turn // 2 % len(WAYS)], turn % 2 == 1
+        way, state = list(WAYS)[turn // len(BOUNDS_MS) % len(WAYS)], list(BOUNDS_MS)[turn % len(BOUNDS_MS)]
         turn += 1
-        start_print(held)
-        with WAYS[way](held) as send, held.held() if hold else contextlib.nullcontext():
-            found.stops.append(Stop(way, hold, time.monotonic_ns()))
+        machine.begin()
+        who, stopping = WAYS[way]
+        with stopping(machine, who.format(turn)) as send, machine.loop(state):
+            sent_ns = time.monotonic_ns()
             send()
-            held.wait_for(lambda: not held.fan_turns, f"the node is stopped by {way}")
-        held.wait_for(lambda: held.service.cause != "", "the cause is there")
-        cause = held.service.cause
-        if not any(word in cause.lower() for word in ("emergency", "m112", "stopped by")):
-            found.problems.append(f"stop {turn} by {way}: the cause is {cause!r}")
-        held.restart(firmware=False)
+            machine.wait_for(lambda: not fan_turns(machine.folder), f"the node is stopped by {way}")
+        found.stops.append(Stop(way, state, sent_ns))
+        machine.wait_for(lambda: machine.state["state"] == "shutdown", "it is shut down")
+        if who.format(turn) not in (cause := machine.state["cause"]):
+            found.problems.append(f"stop {turn} by {way}, the loop {state}: the cause is {cause!r}")
+        machine.restart()
 
 
 # ---------------------------------------------------------------------------------------------- the figures
 
 
-def times_ms(stops: Sequence[Stop], folder: Path) -> list[float]:
-    """Return how long each stop took to the pin of its node."""
-    log = EdgeLog(folder / f"{NODE}.edges")
-    pin = firmware_dictionary("canductor-node-toolhead").enumerations["pin"].values[PIN]
-    off = [
-        int(at_ns)
-        for clocks, _, levels in log.edges(pin)
-        for at_ns, level in zip(log.ticks_to_monotonic_ns(clocks), levels, strict=True)
-        if not level
-    ]
-    return [(min(at for at in off if at > stop.sent_ns) - stop.sent_ns) / 1e6 for stop in stops]
-
-
 def table(stops: Sequence[Stop], taken_ms: Sequence[float]) -> Iterator[str]:
-    """Yield a line for each way in, with the loop free and held."""
-    for held, bound_ms in ((False, FREE_MS), (True, HELD_MS)):
+    """Yield a line for each way in and each state of the loop."""
+    for state, bound_ms in BOUNDS_MS.items():
         every: list[float] = []
-        state = "held" if held else "free"
         for way in WAYS:
             found = [
-                ms for stop, ms in zip(stops, taken_ms, strict=True) if (stop.way, stop.held) == (way, held)
+                ms for stop, ms in zip(stops, taken_ms, strict=True) if (stop.way, stop.loop) == (way, state)
             ]
             every += found
             if found:
                 yield (
-                    f"loop {state}  {way:<27} n {len(found):4}, median {statistics.median(found):6.2f} ms,"
-                    f" worst {max(found):6.2f} ms"
+                    f"loop {state:<11}  {way:<27} n {len(found):4},"
+                    f" median {statistics.median(found):6.2f} ms, worst {max(found):6.2f} ms"
                 )
-        above = sum(ms > bound_ms for ms in every)
         if every:
-            yield (f"loop {state}: n {len(every)}, worst {max(every):.2f} ms, {above} above {bound_ms:g} ms")
+            yield f"loop {state}: n {len(every)}, worst {max(every):.2f} ms; bound {bound_ms:g} ms"
 
 
-def verdict(found: Found) -> list[str]:
-    """Return what does not hold, in sentences; none of them is about times."""
+def verdict(found: Found, taken_ms: Sequence[float]) -> list[str]:
+    """Return what does not hold, in sentences; TAKEN_MS are the times of the stops."""
     wrong = [f"PROBLEM: {sentence}" for sentence in found.problems]
-    missing = [
-        f"{way} with the loop {'held' if held else 'free'}"
-        for way in WAYS
-        for held in (False, True)
-        if not any((stop.way, stop.held) == (way, held) for stop in found.stops)
+    wrong += [
+        f"a stop by {stop.way}, the loop {stop.loop}, took {ms:.2f} ms; bound {BOUNDS_MS[stop.loop]:g} ms"
+        for stop, ms in zip(found.stops, taken_ms, strict=True)
+        if ms > BOUNDS_MS[stop.loop]
     ]
+    made = {(stop.way, stop.loop) for stop in found.stops}
+    missing = [f"{way}, the loop {state}" for way in WAYS for state in BOUNDS_MS if (way, state) not in made]
     if missing:
-        wrong.append(f"nobody stopped the machine by {', '.join(missing)}; give it more minutes")
-    if not found.counts["visits"] or not found.counts["bursts of noise"]:
+        wrong.append(f"nobody stopped the machine by {'; '.join(missing)}: give it more minutes")
+    if not found.counts["visits"] or not any(name.startswith("noise") for name in found.counts):
         wrong.append("no fuzzer came in")
     return wrong
 
@@ -310,30 +428,22 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    found = Found()
-
-    def test(held: FuzzedService) -> None:
-        held.ready()
-        with visitors(held, given.seed, found), noise(held, given.seed, found):
-            stop_again_and_again(held, given.minutes, found)
-
-    begun_s = time.monotonic()
+    found, begun_s = Found(), time.monotonic()
     with tempfile.TemporaryDirectory() as name:
-        serve_held(Path(name), test, FuzzedService)
-        taken_ms = times_ms(found.stops, Path(name))
-    for row in table(found.stops, taken_ms):
-        sys.stdout.write(row + "\n")
-    load = " ".join(f"{value:.1f}" for value in os.getloadavg())
+        with Machine(Path(name)) as machine, visitors(machine, given.seed, found):
+            stop_again_and_again(machine, given.minutes, found)
+        taken_ms = stopped_after_ms(Path(name), [stop.sent_ns for stop in found.stops])
     each_s = (time.monotonic() - begun_s) / max(1, len(found.stops))
-    counts: dict[str, Any] = dict(found.counts)
-    sys.stdout.write(
-        f"{len(found.stops)} stops, one in {each_s:.1f} s; {counts.get('visits', 0):,} visits,"
-        f" {counts.get('requests sent', 0):,} requests, {counts.get('bursts of noise', 0):,} bursts of noise;"
-        f" load {load}\n"
-    )
-    wrong = verdict(found)
-    for sentence in wrong:
-        sys.stdout.write(sentence + "\n")
+    load = " ".join(f"{value:.1f}" for value in os.getloadavg())
+    noise = {name: count for name, count in sorted(found.counts.items()) if name.startswith("noise")}
+    rows = [
+        *table(found.stops, taken_ms),
+        f"{len(found.stops)} stops, one in {each_s:.1f} s; load {load}",
+        f"{found.counts['visits']:,} visits, {found.counts['requests sent']:,} requests",
+        *(f"{name}: {count:,} bursts" for name, count in noise.items()),
+        *(wrong := verdict(found, taken_ms)),
+    ]
+    sys.stdout.write("\n".join(rows) + "\n")
     return 1 if wrong else 0
 
 

@@ -5,36 +5,47 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.fuzz.live_stops import WAYS, Found, Stop, table, verdict
+from tests.fuzz.live_stops import BOUNDS_MS, WAYS, Found, Stop, table, verdict
 
 
 def sound() -> Found:
-    stops = [Stop(way, held, 1_000) for way in WAYS for held in (False, True)]
-    return Found(stops, [], Counter({"visits": 3, "bursts of noise": 2}))
+    stops = [Stop(way, state, 1_000) for way in WAYS for state in BOUNDS_MS]
+    return Found(stops, [], Counter({"visits": 3, "noise: page": 2}))
 
 
 def test_nothing_is_wrong() -> None:
-    assert verdict(sound()) == []
+    found = sound()
+    assert verdict(found, [BOUNDS_MS[stop.loop] for stop in found.stops]) == []
 
 
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
         (lambda found: found.problems.append("the cause is 'lost node'"), "lost node"),
-        (lambda found: found.stops.pop(), "terminal, M112 with the loop held"),
+        (lambda found: found.stops.pop(), "serial host, M112, the loop calculating"),
         (lambda found: found.counts.pop("visits"), "no fuzzer came in"),
-        (lambda found: found.counts.pop("bursts of noise"), "no fuzzer came in"),
+        (lambda found: found.counts.pop("noise: page"), "no fuzzer came in"),
     ],
 )
-def test_each_thing_that_is_wrong_is_said(spoil: Callable[[Found], object], words: str) -> None:
+def test_each_thing_that_is_wrong_is_reported(spoil: Callable[[Found], object], words: str) -> None:
     found = sound()
     spoil(found)
-    (sentence,) = verdict(found)
+    (sentence,) = verdict(found, [1.0] * len(found.stops))
     assert words in sentence
 
 
-def test_the_table_tells_the_worst_and_how_many_are_above_the_bound() -> None:
-    stops = [Stop("TCP, new", held, 0) for held in (False, False, True)]
+@pytest.mark.parametrize("state", BOUNDS_MS)
+def test_a_late_stop_is_wrong(state: str) -> None:
+    found = sound()
+    taken_ms = [1.0] * len(found.stops)
+    late = next(number for number, stop in enumerate(found.stops) if stop.loop == state)
+    taken_ms[late] = BOUNDS_MS[state] + 0.01
+    (sentence,) = verdict(found, taken_ms)
+    assert f"the loop {state}, took {taken_ms[late]:.2f} ms" in sentence
+
+
+def test_the_table_has_the_worst_of_each_state() -> None:
+    stops = [Stop("TCP, new", state, 0) for state in ("free", "free", "held")]
     rows = list(table(stops, [3.0, 12.0, 20.0]))
-    assert rows[1] == "loop free: n 2, worst 12.00 ms, 1 above 10 ms"
-    assert rows[3] == "loop held: n 1, worst 20.00 ms, 0 above 50 ms"
+    assert rows[1] == "loop free: n 2, worst 12.00 ms; bound 10 ms"
+    assert rows[3] == "loop held: n 1, worst 20.00 ms; bound 50 ms"

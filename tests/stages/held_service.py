@@ -24,6 +24,7 @@ from coordinator.runtime.linux_host import LinuxHost
 from coordinator.service.api.methods import add_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings, ServiceState
 from coordinator.service.core.typed import Typed
+from coordinator.service.state.log_ring import Entry
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.loop_watchdog import WatchedLoop
 from nodes.virtual.edge_log import EdgeLog
@@ -49,24 +50,12 @@ class HeldService:
         self.tree = StateTree()
         self.stop_path: StopPath
         self.terminal = -1
-        """Where a user types."""
+        """Where a user types, if it is the service's own."""
 
     @property
     def fan_turns(self) -> bool:
         """Whether the toolhead's fan is on, by its pin."""
-        return PlantPage.at(self.folder, NODE).item(PlantItemKind.FAN, "fan").value > 0
-
-    def stopped_after_ms(self, sent_ns: Sequence[int]) -> list[float]:
-        """Return how long after each of SENT_NS (CLOCK_MONOTONIC) the fan's pin went low."""
-        log = EdgeLog(self.folder / f"{NODE}.edges")
-        pin = firmware_dictionary("canductor-node-toolhead").enumerations["pin"].values[FAN_PIN]
-        off = [
-            int(at_ns)
-            for clocks, _, levels in log.edges(pin)
-            for at_ns, level in zip(log.ticks_to_monotonic_ns(clocks), levels, strict=True)
-            if not level
-        ]
-        return [(min(at for at in off if at > sent) - sent) / 1e6 for sent in sent_ns]
+        return fan_turns(self.folder)
 
     def ready(self) -> None:
         """Wait until the machine is ready, and switch the fan on."""
@@ -124,6 +113,10 @@ class HeldService:
                 await asyncio.gather(serving, return_exceptions=True)
             await testing
 
+    def hear(self, entry: Entry) -> None:
+        """Take note of a line of the service's log."""
+        self.lines.append(str(entry["text"]))
+
     @asynccontextmanager
     async def interfaces(self) -> AsyncIterator[None]:
         """Serve on all ways in."""
@@ -134,7 +127,7 @@ class HeldService:
             LinuxHost(),
             self.tree,
             settings,
-            on_line=lambda entry: self.lines.append(str(entry["text"])),
+            on_line=self.hear,
         )
         add_methods(self.service, registry)
         path = self.stop_path = StopPath(self.service)
@@ -156,6 +149,24 @@ class HeldService:
             await gateway.close()
 
 
+def fan_turns(folder: Path) -> bool:
+    """Return whether the fan of the toolhead in FOLDER is on, by its pin."""
+    return PlantPage.at(folder, NODE).item(PlantItemKind.FAN, "fan").value > 0
+
+
+def stopped_after_ms(folder: Path, sent_ns: Sequence[int]) -> list[float]:
+    """Return how long after each of SENT_NS (CLOCK_MONOTONIC) the fan's pin went low; its node has ended."""
+    log = EdgeLog(folder / f"{NODE}.edges")
+    pin = firmware_dictionary("canductor-node-toolhead").enumerations["pin"].values[FAN_PIN]
+    off = [
+        int(at_ns)
+        for clocks, _, levels in log.edges(pin)
+        for at_ns, level in zip(log.ticks_to_monotonic_ns(clocks), levels, strict=True)
+        if not level
+    ]
+    return [(min(at for at in off if at > sent) - sent) / 1e6 for sent in sent_ns]
+
+
 H = TypeVar("H", bound=HeldService)
 
 
@@ -163,17 +174,20 @@ def serve_held(
     folder: Path,
     test: Callable[[H], None],
     kind: type[H] = HeldService,  # type: ignore[assignment]
+    *,
+    terminal: int | None = None,
 ) -> None:
-    """Run TEST with a service in FOLDER, of this KIND."""
+    """Run TEST with a service in FOLDER, of this KIND; TERMINAL is its end of one, None: it gets one."""
     held = kind(folder)
     stdin = sys.stdin
-    held.terminal, theirs = pty.openpty()
     with real_nodes(MACHINE, folder), contextlib.ExitStack() as stack:
-        stack.callback(os.close, held.terminal)
+        if terminal is None:
+            held.terminal, terminal = pty.openpty()
+            stack.callback(os.close, held.terminal)
         # Homing across nodes needs the host every quarter of a second, which a busy computer may not give it.
         with (folder / CONFIG).open("a", encoding="utf-8") as config:
             config.write("\n[force_move]\nenable_force_move: True\n")
-        sys.stdin = stack.enter_context(os.fdopen(theirs))
+        sys.stdin = stack.enter_context(os.fdopen(terminal))
         try:
             run_to_end(lambda: held.serve(lambda: test(held)), WatchedLoop)
         finally:

@@ -1,0 +1,52 @@
+"""Plain restarts, again and again, from whatever the machine does: each one succeeds at the first try."""
+
+import asyncio
+import random
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from coordinator.assembly.load import load_machine
+from coordinator.simulate.scenario import load
+from coordinator.simulate.stage import Stage
+from tests.stages.served import Served, running
+
+SCENARIOS: Final = Path("coordinator/simulate/scenarios")
+RESTARTS: Final = 12
+JOB: Final = "G28\n" + "G1 X100 F6000\nG1 X20 F6000\n" * 500
+
+
+async def act(stage: Served, chance: random.Random) -> None:
+    """Print for a while, or rest; then stop, and wait for the nodes to report that, or for less, or go on."""
+    if chance.random() < 0.75:
+        await stage.call("job.start", file="job.gcode")
+        await asyncio.sleep(chance.choice((0.0, 0.01, 0.3, 1.0, chance.uniform(0.0, 8.0))))
+    printing = stage.service.active_job is not None
+    if printing or chance.random() < 0.5:
+        await stage.call("machine.emergency_stop")
+        await stage.until_state("shutdown")
+        await asyncio.sleep(chance.choice((0.0, 0.001, 0.05, 0.5, 2.0)))
+
+
+@pytest.mark.parametrize(
+    ("scenario", "seed"),
+    [("clean", 1), ("corexy_mixed", 2), ("legacy_mixed", 3), ("loss_5_percent", 4), ("uart_noise", 5)],
+)
+def test_each_restart_succeeds_at_the_first_try(tmp_path: Path, scenario: str, seed: int) -> None:
+    world = Stage(load(SCENARIOS / f"{scenario}.toml"), seed)
+    config = tmp_path / "printer.cfg"
+    config.write_text(Path(world.description.path).read_text())
+    chance = random.Random(seed)
+
+    async def main() -> None:
+        async with running(Served(tmp_path, lambda: load_machine(str(config)), world.host)) as stage:
+            stage.write_job(JOB)
+            for number in range(1, RESTARTS + 1):
+                await act(stage, chance)
+                await stage.call("machine.restart")
+                await stage.until(lambda: stage.service.starts == number + 1, "the next start")  # noqa: B023
+                await stage.until_state("ready")
+
+    with asyncio.Runner(loop_factory=world.make_loop) as runner:
+        runner.run(main())
