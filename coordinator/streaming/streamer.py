@@ -23,12 +23,14 @@ from coordinator.streaming.worker import SEND_AHEAD_S, START_LEAD_S, Cycle, Moti
 from nodes.support.errors import CanductorError
 
 CYCLE_S: Final = 0.05
-FULL_CYCLE_S: Final = 0.4
+FULL_CYCLE_S: Final = 0.5
 """While planner and commands reach as far ahead as they may; taken off the lead of SEND_AHEAD_S."""
+BUSY_CYCLE_S: Final = 0.4
+"""The same on a busy bus: that it cannot carry the plan has to be found in time."""
 REST_CYCLE_S: Final = 1.0
 """At rest, where a cycle only steers the clocks of secondary nodes, predicted over a second."""
 BUSY_START_LEAD_S: Final = 0.6
-"""START_LEAD_S on a bus with other traffic, where the first commands, dense as in every ramp, take longer."""
+"""START_LEAD_S on a busy bus, where the first commands, dense as in every ramp, take longer."""
 BUSY_LOAD: Final = 0.3
 """Share of a bus's time from which it counts as busy."""
 SETTLE_S: Final = 0.05
@@ -189,7 +191,7 @@ class Streamer:
             return CYCLE_S
         ahead_s = self.worker.steps.generated_until - self.print_time_now()
         if isinstance(cycle.event, Full) and ahead_s > SEND_AHEAD_S - CYCLE_S:
-            return FULL_CYCLE_S
+            return BUSY_CYCLE_S if self._machine.is_busy(BUSY_LOAD) else FULL_CYCLE_S
         if isinstance(cycle.event, StandstillAction) and self._standstill is not None:
             return REST_CYCLE_S
         stands_s = cycle.planned.stands_from_s

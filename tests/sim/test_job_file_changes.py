@@ -17,7 +17,7 @@ from tests.stages.served import Served, running
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
 FILLER = "; " + "x" * 2000
 """So that few moves take several pieces of the file."""
-MOVES = 120
+MOVES = 240
 
 
 def job(end_mm: int) -> str:
