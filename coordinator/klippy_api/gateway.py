@@ -223,10 +223,7 @@ class Gateway:
 
     def watch_stops(self, connection: Connection, opened: socket.socket | None) -> None:
         """Look for stops in what the socket of CONNECTION has unread, while the loop is held."""
-        if opened is None:
-            return
-        if connection.transport.is_closing():
-            self._stop_lane.settle(opened)
+        if opened is None or connection.transport.is_closing():
             return
         client = connection.client
         self._stop_lane.watch(connection, opened, lambda unread: self._find_stop(client, unread))

@@ -23,7 +23,7 @@ HELD_MAX: Final = 64
 """Connections that are accepted while the loop is held; others wait for the loop."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Arrival:
     """A connection that was accepted and has no protocol yet."""
 
@@ -38,7 +38,8 @@ class Acceptor:
     """Accepts at LISTENER, a bound socket that is closed with this, from now on, for the running loop.
 
     ARRIVE says what to do with a connection, in the thread that has accepted it: the loop's or LANE's. Who
-    gives a connection up has to tell LANE (``StopLane.settle``). Raises OSError, with LISTENER closed.
+    serves it has to tell LANE when that has begun or failed (``StopLane.settle``). Raises OSError, with
+    LISTENER closed.
     """
 
     def __init__(

@@ -32,8 +32,8 @@ class StopLane:
         self._stop = stop
         self._lock = threading.Lock()
         self._unread: dict[Hashable, Finder] = {}
-        self._new: dict[int, Finder] = {}
-        """Of connections without a protocol, by the number of their file."""
+        self._new: dict[socket.socket, Finder] = {}
+        """Of connections without a protocol."""
         self._peeking: dict[Hashable, socket.socket] = {}
         self._finders: list[Finder] = []
         self._accepting: dict[Hashable, Callable[[], None]] = {}
@@ -44,16 +44,15 @@ class StopLane:
         """Look at what OPENED has unread, with FIND_STOP, until ``forget`` of KEY; it is not new any more."""
         with contextlib.suppress(OSError):  # it has closed already
             own = socket.socket(fileno=os.dup(opened.fileno()))
-            with self._lock:
-                self._peeking[key] = own
-                self._unread[key] = functools.partial(find_unread, own, find_stop)
-        self.settle(opened)
+            self._peeking[key] = own
+            self.watch_with(key, opened, functools.partial(find_unread, own, find_stop))
 
     def watch_with(self, key: Hashable, opened: socket.socket | TransportSocket, find: Finder) -> None:
         """Ask FIND about OPENED, until ``forget`` of KEY; it is not new any more."""
         with self._lock:
             self._unread[key] = find
-            self._new.pop(opened.fileno(), None)
+            for new in [new for new in self._new if new.fileno() == opened.fileno()]:
+                del self._new[new]
 
     def forget(self, key: Hashable) -> None:
         """Look at it no more, or listen there no more; without effect for an unknown KEY."""
@@ -63,10 +62,10 @@ class StopLane:
             if (own := self._peeking.pop(key, None)) is not None:
                 own.close()
 
-    def settle(self, opened: socket.socket | TransportSocket) -> None:
-        """Look no more at the new connection OPENED: it is about to be closed."""
+    def settle(self, opened: socket.socket) -> None:
+        """Look no more at OPENED as a new connection: it has its protocol, or was given up."""
         with self._lock:
-            self._new.pop(opened.fileno(), None)
+            self._new.pop(opened, None)
 
     def listen(self, key: Hashable, accept: Callable[[], None]) -> None:
         """Call ACCEPT at each look, until ``forget`` of KEY: it takes new connections."""
@@ -92,9 +91,9 @@ class StopLane:
     # ---- On the loop, or in the lane's thread ----
 
     def watch_new(self, opened: socket.socket, find: Finder) -> None:
-        """Ask FIND about OPENED, just accepted, until it is watched under a key, or ``settle``."""
+        """Ask FIND about OPENED, just accepted, until it is watched under a key, or ``settle`` of it."""
         with self._lock:
-            self._new[opened.fileno()] = find
+            self._new[opened] = find
 
     # ---- In the lane's thread ----
 

@@ -99,23 +99,21 @@ class TcpListener:
         """Return how to look for a stop in what OPENED sends, and to serve it; in any thread."""
         address = _address_of(opened)
         find_stop = functools.partial(self._find_stop, address)
-        if self._context is None:
-            find = functools.partial(find_unread, opened, find_stop)
-            return Arrival(opened, find, functools.partial(self._take, opened, address), opened.close)
-        tls = TlsState(opened.dup(), self._context)
+        tls = None if self._context is None else TlsState(opened.dup(), self._context)
+        find = functools.partial(find_unread, opened) if tls is None else tls.find_in
+        return Arrival(
+            opened,
+            functools.partial(find, find_stop),
+            functools.partial(self._take, opened, address, tls),
+            functools.partial(self._give_up, opened, tls),
+        )
 
-        def close() -> None:
-            tls.release()
-            opened.close()
-
-        find = functools.partial(tls.find_in, find_stop)
-        return Arrival(opened, find, functools.partial(self._take, opened, address, tls), close)
-
-    def _take(self, opened: socket.socket, address: str, tls: TlsState | None = None) -> None:
+    def _take(self, opened: socket.socket, address: str, tls: TlsState | None) -> None:
         if self._context is not None and len(self._entering) >= self._handshakes_max:
             self._make_room()
         if not self._may_enter(len(self._entering)):
             self.refused += 1
+            self._stop_lane.settle(opened)
             self._give_up(opened, tls)
             return
         task = asyncio.get_running_loop().create_task(self._enter(opened, tls))
@@ -138,11 +136,12 @@ class TcpListener:
 
     def _end_entering(self, opened: socket.socket, tls: TlsState | None, task: asyncio.Task[None]) -> None:
         self._entering.pop(task, None)
+        self._stop_lane.settle(opened)
         if task.cancelled() or isinstance(task.exception(), OSError):  # no TLS, not in time, or gone
             self._give_up(opened, tls)
 
-    def _give_up(self, opened: socket.socket, tls: TlsState | None) -> None:
-        self._stop_lane.settle(opened)
+    @staticmethod
+    def _give_up(opened: socket.socket, tls: TlsState | None) -> None:
         opened.close()
         if tls is not None:
             tls.release()

@@ -69,8 +69,8 @@ class UnixListener:
 
     def _end_serving(self, opened: socket.socket, task: asyncio.Task[object]) -> None:
         self._serving.discard(task)
+        self._lane.settle(opened)
         if task.cancelled() or task.exception() is not None:  # it has left, or this is closed
-            self._lane.settle(opened)
             opened.close()
 
 

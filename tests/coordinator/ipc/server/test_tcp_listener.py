@@ -13,7 +13,9 @@ import pytest
 
 from coordinator.ipc.client.client import Client
 from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.server import tls_context
 from coordinator.ipc.server.settings import TcpSettings
+from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.tcp_listener import (
     FILES_MAX,
     HANDSHAKE_S,
@@ -121,6 +123,33 @@ def test_without_files_left_connections_wait_and_nothing_is_said(
     with caplog.at_level(logging.ERROR):
         jump_loop.run(main())
     assert not caplog.records
+
+
+def test_what_nobody_looks_at_is_not_kept(certificate: tuple[Path, Path]) -> None:
+    """As the page's connections: they are served, and no stop is looked for in them."""
+
+    async def main() -> None:
+        come: asyncio.Queue[None] = asyncio.Queue()
+
+        class Guest(asyncio.Protocol):
+            def connection_made(self, transport: asyncio.BaseTransport) -> None:
+                come.put_nowait(None)
+
+        for context in (None, tls_context(*certificate)):
+            lane = StopLane()
+            listener = TcpListener(Guest, context, stop_lane=lane)
+            await listener.open("127.0.0.1", 0)
+            trusting = None if context is None else ssl.create_default_context(cafile=str(certificate[0]))
+            _, writer = await asyncio.open_connection(*listener.addresses[0], ssl=trusting)
+            await come.get()
+            async with asyncio.timeout(30):
+                while lane._new:  # noqa: ASYNC110 (it tells nobody)
+                    await asyncio.sleep(0.001)
+            assert listener.entering == 0
+            writer.transport.abort()
+            listener.close()
+
+    jump_loop.run(main())
 
 
 def test_who_resets_at_once_leaves_nothing_behind(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
