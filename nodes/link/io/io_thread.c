@@ -50,24 +50,29 @@ static uint64_t monotonic_ns(void) {
 
 // ------------------------------------------------------------------------------------------------ transfer
 
-static void read_all(struct io_thread *thread, uint64_t now) {
+// Reads what has arrived; returns the time after the last read that gave something, NOW before the first.
+// Each piece gets the time after its own read: it may have arrived after NOW, and a node's clock is believed
+// to have been read before its answer was received.
+static uint64_t read_all(struct io_thread *thread, uint64_t now) {
     // Bounded, so that a flood cannot prevent sending; the remainder wakes the thread again at once. Enough
     // for everything that waits after a stall of the host, so that no acknowledgement counts as late.
     for (int rounds = 0; rounds < 1024 && !io_ended(thread->bus); rounds++) {
         size_t room = thread->kind == IO_CAN_PACKET ? FRAME : sizeof thread->in;
         ssize_t size = read(thread->fd, thread->in, room);
         if (size > 0) {
+            now = monotonic_ns();
             io_received(thread->bus, thread->in, (size_t)size, now);
             if (thread->kind != IO_CAN_PACKET && (size_t)size < room)
-                return; // a stream returned less than requested: it is empty
+                break; // a stream returned less than requested: it is empty
         } else if (size == 0) {
             io_end(thread->bus, 0);
         } else if (errno == EAGAIN) {
-            return;
+            break;
         } else if (errno != EINTR) {
             io_end(thread->bus, errno);
         }
     }
+    return now;
 }
 
 // Writes bytes to the kernel; returns 0 when it accepts no more.
@@ -177,7 +182,7 @@ static void *run(void *argument) {
             thread->kernel_full = 0;
         // After sleeping too long, on a busy computer, read what has arrived before timers are evaluated.
         if ((seen & ~POLLOUT) || overslept(thread, now))
-            read_all(thread, now);
+            now = read_all(thread, now);
         io_handle_time(thread->bus, now);
         write_all(thread, now);
         seen = sleep_unlocked(thread, now);

@@ -32,6 +32,7 @@ struct step {
     ssize_t size;
     int error;
     const uint8_t *data; // of a read
+    uint64_t takes_ns;   // time that passes meanwhile, of a read
 };
 
 static struct kernel {
@@ -244,6 +245,7 @@ static inline ssize_t kernel_read(int fd, void *out, size_t room) {
     kernel.reads_left--;
     const struct step *step = &kernel.reads[kernel.reads_at++];
     CHECK(step->size <= (ssize_t)room);
+    kernel.now_ns += step->takes_ns;
     if (step->size > 0)
         memcpy(out, step->data, (size_t)step->size);
     return kernel_result(step);

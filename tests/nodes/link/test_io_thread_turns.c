@@ -30,7 +30,8 @@ static void stop(struct io_thread *thread) {
 }
 
 static void reading_gives(ssize_t size, int error, const void *data) {
-    kernel.reads[kernel.reads_at + kernel.reads_left++] = (struct step){size, error, data};
+    kernel.reads[kernel.reads_at + kernel.reads_left++] =
+        (struct step){.size = size, .error = error, .data = data};
 }
 
 static void writing_gives(ssize_t size, int error) {
@@ -386,6 +387,23 @@ static void a_thread_that_overslept_reads_first(void) {
     stop(thread);
 }
 
+// A computer that is busy stops the thread before a read: what this gives may have come meanwhile, so its
+// time is no earlier than its read. Who judges by the time afterwards judges by the last.
+static void what_is_read_has_the_time_of_its_read(void) {
+    struct io_thread *thread = start(IO_CAN_PACKET, &unknown_speed);
+    struct io_event events[3];
+    uint64_t began_ns = kernel.now_ns;
+    for (size_t i = 0; i < 3; i++) {
+        reading_gives(FRAME, 0, &a_frame);
+        kernel.reads[i].takes_ns = 7 * MS;
+    }
+    kernel_turn(POLLIN);
+    CHECK_EQUAL(io_take(thread->bus, events, 3), 3);
+    for (size_t i = 0; i < 3; i++)
+        CHECK_EQUAL(events[i].received_ns, began_ns + (i + 1) * 7 * MS);
+    stop(thread);
+}
+
 // -------------------------------------------------------------------------------------------- kernel's queue
 
 // How many of 19 frames follow one that was refused, when the kernel has WAITING bytes of memory in use and
@@ -509,6 +527,7 @@ int main(void) {
     the_thread_sleeps_until_the_next_deadline();
     a_thread_that_was_woken_sends_the_rest();
     a_thread_that_overslept_reads_first();
+    what_is_read_has_the_time_of_its_read();
     a_sockets_buffers_are_counted_as_the_writes_they_hold();
     a_serial_lines_bytes_are_counted();
     return 0;
