@@ -233,7 +233,9 @@ class Gateway:
         return next((who for who in stops if who is not None), None)
 
     def _find_stop_of_new(self, opened: socket.socket, unread: bytes) -> str | None:
-        return self._find_stop(Client(""), unread) if may_use(peer_of(opened)[1]) else None
+        if not unread or not may_use(peer_of(opened)[1]):  # without bytes it may have closed
+            return None
+        return self._find_stop(Client(""), unread)
 
     def forget(self, connection: Connection) -> None:
         """Take note that CONNECTION is over."""

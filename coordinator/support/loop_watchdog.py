@@ -140,6 +140,7 @@ class LoopWatchdog:
         self._left_out = 0
         self._seen_s = 0.0
         self._stuck_s = 0.0
+        self._failed_s = 0.0
         self._cpu_clock = time.pthread_getcpuclockid(self._loop_thread)
         self._first = (0.0, 0.0, 0.0)
         """Of the hold at hand: since when, when it was looked at first, the loop's processor time then."""
@@ -168,7 +169,9 @@ class LoopWatchdog:
                 self._while_held()
                 self._look(since_s)
             except Exception:  # noqa: BLE001 (it has to go on: it may be what stops the machine)
-                show_error(traceback.format_exc())
+                if self._failed_s != since_s:  # once for each hold
+                    show_error(traceback.format_exc())
+                self._failed_s = since_s
             finally:
                 sys.setswitchinterval(usual_s)
 

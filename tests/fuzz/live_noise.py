@@ -1,7 +1,7 @@
 """Random bytes on the ways into a service that live_visits.py does not know.
 
-Usage: python -m tests.fuzz.live_noise FOLDER PAGE TLS METRICS SEED; ends with its standard input. File
-descriptor 3 is the service's terminal. PAGE, TLS and METRICS are ports, PAGE several with commas between.
+Usage: python -m tests.fuzz.live_noise FOLDER PAGE TLS METRICS FD SEED; ends with its standard input. PAGE,
+TLS and METRICS are ports, PAGE several with commas between; FD is the file descriptor of the terminal.
 What is sent is bytes, requests of HTTP and parts of them, beginnings of TLS, lines of nonsense, and uploads
 that are broken off. Prints one JSON line: how many bursts came on each way.
 """
@@ -20,7 +20,6 @@ from typing import Final
 
 from tests.fuzz.ipc_target import line
 
-TERMINAL_FD: Final = 3
 PAUSE_S: Final = 0.01
 """Between two bursts."""
 LETTERS: Final = b"abcxyz0189 =;#(\t\x00\x7f\xc3\n"
@@ -41,9 +40,9 @@ NAMES: Final = ("a.gcode", "../a.gcode", "", "a" * 300 + ".gcode", "\x1b[2J.gcod
 
 def main() -> None:
     """Make noise until standard input ends."""
-    folder, seed = Path(sys.argv[1]), int(sys.argv[5])
+    folder, seed = Path(sys.argv[1]), int(sys.argv[6])
     pages = [int(port) for port in sys.argv[2].split(",")]
-    tls, metrics = int(sys.argv[3]), int(sys.argv[4])
+    tls, metrics, terminal_fd = (int(given) for given in sys.argv[3:6])
     chance, counts = random.Random(seed), Counter[str]()
 
     def some(size: int) -> bytes:
@@ -91,7 +90,7 @@ def main() -> None:
 
     def terminal() -> None:
         with suppress(BlockingIOError):
-            os.write(TERMINAL_FD, nonsense())
+            os.write(terminal_fd, nonsense())
 
     ways: Mapping[str, Callable[[], None]] = {
         "Klippy API": lambda: visit(str(folder / "klippy.sock"), some(3000) + b"\x03"),
@@ -102,7 +101,7 @@ def main() -> None:
         "metrics": lambda: visit(("127.0.0.1", metrics), request()),
         "uploads": lambda: visit(str(folder / "api.sock"), uploads()),
     }
-    os.set_blocking(TERMINAL_FD, False)
+    os.set_blocking(terminal_fd, False)
     while not select.select([sys.stdin], [], [], PAUSE_S)[0]:
         way = chance.choice(list(ways))
         ways[way]()

@@ -36,7 +36,6 @@ from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.protocol.methods import ApiError
 from tests.fuzz.ipc_target import line
 from tests.fuzz.live import ROOT
-from tests.fuzz.live_noise import TERMINAL_FD
 from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
 from tests.stages.held_service import fan_turns, stopped_after_ms
 
@@ -86,7 +85,7 @@ class Machine:
     def __enter__(self) -> Self:
         self.terminal, theirs = pty.openpty()
         self._stack.callback(os.close, self.terminal)
-        command = [sys.executable, "-m", "tests.fuzz.stopped_service", str(self.folder)]
+        command = [sys.executable, "-m", "tests.fuzz.stopped_service", str(self.folder), str(theirs)]
         self._process = self._stack.enter_context(with_terminal(command, theirs))
         self._stack.callback(self._process.communicate)
         os.close(theirs)
@@ -323,19 +322,9 @@ WAYS: Final[Mapping[str, tuple[str, Way]]] = {
 
 
 def with_terminal(command: Sequence[str], terminal: int) -> subprocess.Popen[str]:
-    """Begin COMMAND in a process with TERMINAL as descriptor 3."""
-
-    def give() -> None:
-        os.dup2(terminal, TERMINAL_FD)
-
+    """Begin COMMAND in a process that has the descriptor TERMINAL, too."""
     return subprocess.Popen(
-        command,
-        cwd=ROOT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        pass_fds=(TERMINAL_FD,),
-        preexec_fn=give,  # noqa: PLW1509 (no thread holds a lock that it needs)
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=(terminal,)
     )
 
 
@@ -345,6 +334,7 @@ def visitors(machine: Machine, seed: int, found: Found) -> Iterator[None]:
     ports = [page.split("/#")[0].rpartition(":")[2] for page in machine.ways["pages"]]
     visits = [str(machine.folder / "open.sock"), str(machine.ways["tcp"]), WATCH_TOKEN]
     noise = [str(machine.folder), ",".join(ports), str(machine.ways["tls"]), str(machine.ways["metrics"])]
+    noise.append(str(machine.terminal))
     with contextlib.ExitStack() as stack:
         running = {
             name: stack.enter_context(

@@ -1,9 +1,9 @@
 """A machine on virtual nodes that is served on all ways in, and whose control loop can be held.
 
-A process of its own, for live_stops.py: `python -m tests.fuzz.stopped_service FOLDER`. Its terminal is
-file descriptor 3. It prints one JSON line of ports and links once it serves. A line ``waiting`` or
-``calculating`` on standard input holds the loop in that manner, which is answered by ``held``; the next line
-lets it go. It ends with its standard input.
+A process of its own, for live_stops.py: `python -m tests.fuzz.stopped_service FOLDER FD`, FD the
+file descriptor of its terminal. It prints one JSON line of ports and links once it serves. A line ``waiting``
+or ``calculating`` on standard input holds the loop in that manner, which is answered by ``held``; the next
+line lets it go. It ends with its standard input.
 """
 
 import json
@@ -28,7 +28,6 @@ from tests.coordinator.certificates import make_certificate
 from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
 from tests.stages.held_service import HeldService, serve_held
 
-TERMINAL_FD: Final = 3
 LOOPBACK: Final = "127.0.0.1"
 
 
@@ -109,7 +108,7 @@ def main() -> None:
                 say("held")
                 commands.readline()
 
-    serve_held(Path(sys.argv[1]), obey, OpenService, terminal=TERMINAL_FD)
+    serve_held(Path(sys.argv[1]), obey, OpenService, terminal=int(sys.argv[2]))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Accepts connections, so that an emergency stop in their first bytes is found whoever is to read them.
+"""Accepts connections, and has the stop lane watch each of them from then on.
 
-The servers of asyncio know a connection some rounds of the loop before its protocol does; a stop that comes
-while one of these rounds is held would wait. Here it is in the stop lane's sight from when it is accepted: by
-the loop, or while that is held, by the lane's thread (docs/adr/0016-stop-path.md).
+asyncio's servers accept a connection several iterations of the loop before its protocol exists. An emergency
+stop on it would wait for the loop if that were held in between. While the loop is held, the stop lane's
+thread accepts connections here (docs/adr/0016-stop-path.md).
 """
 
 import asyncio
@@ -35,11 +35,11 @@ class Arrival:
 
 
 class Acceptor:
-    """Accepts at LISTENER, a bound socket that is closed with this, from now on, for the running loop.
+    """Accepts connections at LISTENER, a bound socket, on the running loop until ``close``, which closes it.
 
-    ARRIVE says what to do with a connection, in the thread that has accepted it: the loop's or LANE's. Who
-    serves it has to tell LANE when that has begun or failed (``StopLane.settle``). Raises OSError, with
-    LISTENER closed.
+    ARRIVE gets each connection, in the thread that accepted it (the loop's or LANE's), and returns how to
+    serve it. The code that serves it calls ``StopLane.settle`` once its protocol exists or serving has
+    failed. Raises OSError, with LISTENER closed.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Acceptor:
         lane.listen(self, self._accept_while_held)
 
     def close(self) -> None:
-        """Accept nobody any more; what is served stays."""
+        """Stop accepting; connections that are served stay open."""
         self._lane.forget(self)
         self._loop.remove_reader(self._listener)
         if self._retry is not None:

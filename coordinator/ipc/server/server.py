@@ -305,6 +305,8 @@ class IpcServer:
 
     def _find_stop(self, opened: socket.socket, unread: bytes) -> str | None:
         """Return who stops the machine with the UNREAD bytes of a new connection over the Unix socket."""
+        if not unread:  # or it has closed
+            return None
         pid, uid = peer_of(opened)
         if not may_use(uid):
             return None

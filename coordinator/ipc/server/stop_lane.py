@@ -98,17 +98,32 @@ class StopLane:
     # ---- In the lane's thread ----
 
     def look(self) -> None:
-        """Look at everything once."""
+        """Look at everything once; a failure hides no stop found elsewhere, and is raised at the end."""
+        failures: list[Exception] = []
         with self._lock:
             accepting = list(self._accepting.values())
         for accept in accepting:
-            accept()
+            try:
+                accept()
+            except Exception as error:  # noqa: BLE001 (as above)
+                failures.append(error)
         with self._lock:
-            found = [find() for find in (*self._finders, *self._unread.values(), *self._new.values())]
-        for who in found:
+            who = self._find(failures)
+        if who is not None:
+            self._stop(who)
+        if failures:
+            raise failures[0]
+
+    def _find(self, failures: list[Exception]) -> str | None:
+        for find in (*self._finders, *self._unread.values(), *self._new.values()):
+            try:
+                who = find()
+            except Exception as error:  # noqa: BLE001 (as above)
+                failures.append(error)
+                continue
             if who is not None:
-                self._stop(who)
-                return
+                return who
+        return None
 
 
 def find_unread(opened: socket.socket, find_stop: FindStop) -> str | None:

@@ -45,7 +45,10 @@ class TlsState:
             self._raw, self._on_news = raw, on_news
 
     def find_in(self, find: Callable[[bytes], str | None]) -> str | None:
-        """Return what FIND finds in what the client has sent and nobody has taken; beside the loop."""
+        """Read from the socket and return FIND of the decrypted bytes that were not taken yet; in any thread.
+
+        A handshake that is under way is continued.
+        """
         with self._lock:
             shakes_hands = not self.is_ready
             news = self.receive()

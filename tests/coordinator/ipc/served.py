@@ -49,7 +49,7 @@ class Served:
     async def server_has(self, entering: int) -> None:
         """Wait until so many connections are on their way in."""
         assert self.server._listener is not None
-        while self.server._listener.entering != entering:  # noqa: ASYNC110 (it tells nobody)
+        while self.server._listener.entering != entering:  # noqa: ASYNC110 (there is no event for it)
             await asyncio.sleep(0.01)
 
     async def script(self, **hello: Any) -> "Script":

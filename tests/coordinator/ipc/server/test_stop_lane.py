@@ -276,7 +276,7 @@ def test_a_new_connection_that_the_loop_has_begun_to_take(tmp_path: Path, rounds
             opened.sendall(line(STOP))
             assert lane.seen() == ["me"]
             assert served.stops == []
-            while not served.stops:  # noqa: ASYNC110 (it tells nobody)
+            while not served.stops:  # noqa: ASYNC110 (there is no event for it)
                 await asyncio.sleep(0)
 
     run(tmp_path, go, stop_lane=lane)
@@ -301,12 +301,40 @@ def test_a_new_connection_over_tcp_that_the_loop_has_begun_to_take(
             done = dialled.shake_hands()
         dialled.send(hello + line(STOP))
         assert lane.sees(["me"])
-        while not served.stops:  # noqa: ASYNC110 (it tells nobody)
+        while not served.stops:  # noqa: ASYNC110 (there is no event for it)
             await asyncio.sleep(0)
         dialled.close()
         await served.server_has(0)
 
     run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, chosen))
+
+
+def test_a_look_that_fails_hides_no_stop() -> None:
+    """Failed before: the first failure ended the look, and each further one of the hold."""
+    lane = Lane()
+
+    def fail() -> str:
+        raise OSError("closed")
+
+    lane.listen("a socket", fail)  # type: ignore[arg-type]
+    lane.look_also(fail)
+    lane.look_also(lambda: "me")
+    with pytest.raises(OSError, match="closed"):
+        lane.look()
+    assert lane.stops == ["me"]
+
+
+def test_a_new_connection_that_has_closed_is_no_failure(tmp_path: Path) -> None:
+    """As one that is cut off while its protocol is made; failed before."""
+    lane = Lane()
+
+    async def go(served: Served) -> None:
+        closed = socket.socket(socket.AF_UNIX)
+        closed.close()
+        assert served.server._find_stop(closed, b"") is None
+        assert lane.seen() == []
+
+    run(tmp_path, go, stop_lane=lane)
 
 
 def test_what_is_given_up_is_not_looked_at(tmp_path: Path) -> None:

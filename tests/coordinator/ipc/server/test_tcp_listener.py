@@ -49,7 +49,7 @@ def test_128_silent_clients_keep_nobody_out(tmp_path: Path, certificate: tuple[P
         assert listener is not None
         silent = [await served.dial(tcp=True) for _ in range(HANDSHAKES_MAX)]
         ends = [asyncio.ensure_future(reader.read()) for reader, _ in silent]
-        while listener.entering < HANDSHAKES_MAX:  # noqa: ASYNC110 (it reports nothing)
+        while listener.entering < HANDSHAKES_MAX:  # noqa: ASYNC110 (there is no event for it)
             await asyncio.sleep(0)
         trusting = ssl.create_default_context(cafile=str(certificate[0]))
         address = f"tls://127.0.0.1:{served.server.tcp_port}"
@@ -113,7 +113,7 @@ def test_without_files_left_connections_wait_and_nothing_is_said(
         await asyncio.sleep(0)  # it listens, and accepts
         guest = socket.create_connection(listener.addresses[0])
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, files_limit[1]))  # what is open stays so
-        while not listener.starved:  # noqa: ASYNC110 (it tells nobody)
+        while not listener.starved:  # noqa: ASYNC110 (there is no event for it)
             await asyncio.sleep(0.01)
         resource.setrlimit(resource.RLIMIT_NOFILE, files_limit)
         await come.get()
@@ -143,7 +143,7 @@ def test_what_nobody_looks_at_is_not_kept(certificate: tuple[Path, Path]) -> Non
             _, writer = await asyncio.open_connection(*listener.addresses[0], ssl=trusting)
             await come.get()
             async with asyncio.timeout(30):
-                while lane._new:  # noqa: ASYNC110 (it tells nobody)
+                while lane._new:  # noqa: ASYNC110 (there is no event for it)
                     await asyncio.sleep(0.001)
             assert listener.entering == 0
             writer.transport.abort()
