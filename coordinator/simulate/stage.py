@@ -216,9 +216,9 @@ class Stage:
 
     # ------------------------------------------------------------------------------------------ performance
 
-    def make_loop(self) -> VirtualLoop:
-        """Return a loop in the world's time."""
-        return self.host.make_loop()
+    def make_loop(self, *, executor_s: float = 0.0) -> VirtualLoop:
+        """Return a loop in the world's time, whose threads take EXECUTOR_S for each thing they do."""
+        return self.host.make_loop(executor_s=executor_s)
 
     def call_at(self, at_ns: int, what: Callable[[], object]) -> None:
         """Call WHAT at AT_NS of true time, between two events; the program goes on at once after it."""
@@ -344,9 +344,9 @@ class SimHost:
         self.usb_switch: SetPower | None = None
         """What switches the power of the USB ports."""
 
-    def make_loop(self) -> VirtualLoop:
+    def make_loop(self, *, executor_s: float = 0.0) -> VirtualLoop:
         """Return a loop in the world's time; ``signal`` goes to the last one made."""
-        self._loop = VirtualLoop(self._world, limit_s=LIMIT_S)
+        self._loop = VirtualLoop(self._world, limit_s=LIMIT_S, executor_s=executor_s)
         return self._loop
 
     def signal(self, number: int, after_s: float = 0.0) -> None:

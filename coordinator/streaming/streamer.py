@@ -31,6 +31,11 @@ REST_CYCLE_S: Final = 1.0
 """At rest, where a cycle only steers the clocks of secondary nodes, predicted over a second."""
 BUSY_START_LEAD_S: Final = 0.6
 """START_LEAD_S on a busy bus, where the first commands, dense as in every ramp, take longer."""
+DELAY_MAX_S: Final = 0.5
+"""More is not counted: a computer that is as slow all the time cannot print, since less lead is left between
+two cycles."""
+DELAY_FADE: Final = 0.8
+"""How much of a delay still counts after each cycle that made commands."""
 BUSY_LOAD: Final = 0.3
 """Share of a bus's time from which it counts as busy."""
 SETTLE_S: Final = 0.05
@@ -71,6 +76,9 @@ class Streamer:
         """Since the cycle at hand began."""
         self._rested = False
         """Whether the cycle at hand comes after a rest in which nothing has come up."""
+        self._delay_s = 0.0
+        """How long cycles have lately taken at most until their commands were handed over: motion on a slow
+        computer needs as much more lead."""
         self._pause: asyncio.Future[None] | None = None
         """Between two cycles."""
         self.cycles = 0
@@ -125,7 +133,7 @@ class Streamer:
         the machine is stopped then.
         """
         self.worker.began_at = await self._machine.query_stepper_counts()
-        self._look_at_load()
+        self._set_start_lead()
         self.began_s = self.worker.begin()
         with self._machine.job(self):
             await self._run()
@@ -163,6 +171,7 @@ class Streamer:
             while not isinstance(event, End):
                 self._called = False
                 self.cycles += 1
+                began_s = self.print_time_now()
                 rested, self._rested = self._rested, False
                 if rested:  # nothing came: it is done sooner than two threads are woken
                     cycle = self.worker.work(event)
@@ -178,6 +187,7 @@ class Streamer:
                 if cycle.batches:
                     await asyncio.sleep(0)  # other tasks wait for one of the two, not for both
                 self._hand_over(cycle)  # last: links and buses begin to work then, and the loop rests
+                self._note_delay(cycle, self.print_time_now() - began_s)
                 if isinstance(event, StandstillAction):
                     await self._attend(event)
                 if event is not None or self.held is not None:
@@ -236,7 +246,7 @@ class Streamer:
     async def _begin_again(self) -> None:
         """Go on where something else has left the steppers."""
         began_at = await self._machine.query_stepper_counts()
-        self._look_at_load()
+        self._set_start_lead()
         self.began_s = self.worker.begin_again(began_at)
 
     def _hand_over(self, cycle: Cycle) -> None:
@@ -248,7 +258,6 @@ class Streamer:
             if self._witness is not None:
                 self._witness.see_sent(cycle.batches, cycle.planned)
             self._machine.check_load()
-        self._look_at_load()
 
     def _report_output(self, cycle: Cycle) -> None:
         for output in cycle.output:
@@ -267,9 +276,14 @@ class Streamer:
             except CanductorError as error:  # such as the loss of a node that may be missing
                 self._on_output(Notice(timed.line, f"{self._job.name}:{timed.line}: {error}"))
 
-    def _look_at_load(self) -> None:
+    def _note_delay(self, cycle: Cycle, delay_s: float) -> None:
+        fade = DELAY_FADE if cycle.batches else 1.0
+        self._delay_s = max(self._delay_s * fade, min(delay_s, DELAY_MAX_S))
+        self._set_start_lead()
+
+    def _set_start_lead(self) -> None:
         busy = self._machine.is_busy(BUSY_LOAD)
-        self.worker.start_lead_s = BUSY_START_LEAD_S if busy else START_LEAD_S
+        self.worker.start_lead_s = (BUSY_START_LEAD_S if busy else START_LEAD_S) + self._delay_s
 
     async def _settle(self, thread: ThreadPoolExecutor) -> None:
         """Bring what is left to the nodes and wait until the last step is executed."""
