@@ -1,8 +1,14 @@
 """Vectors, three linear equations, and where spheres meet."""
 
 import math
+from collections.abc import Sequence
+from operator import mul
+from typing import Final
 
 from coordinator.kinematics.base import Point
+
+_DEPENDENT: Final = 1e-9
+"""Of its length: a column of which less than this is new depends on those before it."""
 
 
 def subtract(a: Point, b: Point) -> Point:
@@ -37,6 +43,36 @@ def solve(rows: tuple[Point, Point, Point], values: Point) -> Point:
         sum(value * column[i] for value, column in zip(values, columns, strict=True)) / determinant
         for i in range(3)
     )
+    return (x, y, z)
+
+
+def fit_point(rows: Sequence[Sequence[float]], values: Sequence[float]) -> Point:
+    """Return the p with rows·p nearest to values (least squares); what no row determines is 0.
+
+    By modified Gram-Schmidt: Björck, Numerical Methods for Least Squares Problems, section 2.4.
+    """
+    left = list(values)
+    directions: list[tuple[int, list[float], list[float]]] = []
+    for axis in range(3):
+        column = [float(row[axis]) for row in rows]
+        length = math.hypot(*column)
+        shares = [0.0] * axis
+        for before, direction, _ in directions:
+            shares[before] = sum(map(mul, direction, column))
+            column = [c - shares[before] * d for c, d in zip(column, direction, strict=True)]
+        rest = math.hypot(*column)
+        if rest > _DEPENDENT * length:
+            directions.append((axis, [c / rest for c in column], [*shares, rest]))
+    solved = [0.0, 0.0, 0.0]
+    for axis, direction, _ in directions:
+        solved[axis] = sum(map(mul, direction, left))
+        left = [v - solved[axis] * d for v, d in zip(left, direction, strict=True)]
+    for index in reversed(range(len(directions))):
+        axis, _, own = directions[index]
+        for later, _, shares in directions[index + 1 :]:
+            solved[axis] -= shares[axis] * solved[later]
+        solved[axis] /= own[axis]
+    x, y, z = solved
     return (x, y, z)
 
 

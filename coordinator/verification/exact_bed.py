@@ -16,7 +16,7 @@ class ExactBed:
     """What a surface adds to Z, and how that changes with each axis."""
 
     def __init__(self, surface: Surface) -> None:
-        nodes = surface.nodes
+        nodes = np.asarray(surface.nodes)
         self._corner = np.array(surface.origin_mm)
         self._spacing = np.array(surface.spacing_mm)
         self.full_below, self.none_above, self._target = surface.fade_mm

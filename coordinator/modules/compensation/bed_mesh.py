@@ -1,11 +1,10 @@
 """[bed_mesh]: the bed is probed at many points, and Z follows its shape."""
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
-
-import numpy as np
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.builtins.machine import follow_surface
@@ -35,7 +34,7 @@ from coordinator.modules.compensation.bed_mesh_options import (
     read_profile,
     read_settings,
 )
-from coordinator.modules.compensation.mesh import Grid, Mesh, Place, adapted, fitting_algorithm
+from coordinator.modules.compensation.mesh import Grid, Heights, Mesh, Place, adapted, fitting_algorithm
 from coordinator.modules.levelling.points import ProbePoints, how_to_measure
 from coordinator.modules.probes.probe import Measured, Measuring, Probe
 from coordinator.modules.programs.exclude_object import ExcludeObject
@@ -242,7 +241,7 @@ class BedMesh(Module):
             raise WordError("no mesh was followed before a crash")
         try:
             mesh = Mesh(
-                np.array(held["heights"], dtype=np.float64),
+                _heights(held["heights"]),
                 _pair(held["minimum"]),
                 _pair(held["maximum"]),
                 str(held["algorithm"]),
@@ -311,12 +310,14 @@ class BedMesh(Module):
         assert self._settings is not None
         grid, profile, zero = wanted.grid, wanted.profile, self._settings.zero
         try:
-            heights = grid.heights(height.__getitem__)
+            reference = 0.0 if zero is None else height[zero]
+            heights = grid.heights(lambda place: height[place] - reference)
         except ValueError as error:
             raise WordError(f"{call.command.name}: {error}") from None
-        mesh = self._settings.mesh(grid, wanted.algorithm, heights - (0.0 if zero is None else height[zero]))
+        mesh = self._settings.mesh(grid, wanted.algorithm, heights)
         yield ProgramAction(lambda job: self.take(job, mesh, profile))
-        found = f"the bed is measured, from {heights.min():.3f} to {heights.max():.3f} mm"
+        lowest, highest = mesh.lowest + reference, mesh.highest + reference
+        found = f"the bed is measured, from {lowest:.3f} to {highest:.3f} mm"
         kept = f"it is profile {profile}, which SAVE_CONFIG writes"
         yield Immediate((f"{found}; {kept}",), lambda: self._keep(profile, mesh))
 
@@ -407,12 +408,12 @@ class BedMesh(Module):
     def _read_check(self, call: Call) -> Reading:
         given = call.parameters("MAX_DEVIATION", "MAX_SLOPE")
         mesh = self._followed(call)
-        found = {"MAX_DEVIATION": float(np.ptp(mesh.heights)), "MAX_SLOPE": _steepest(mesh)}
+        found = {"MAX_DEVIATION": mesh.highest - mesh.lowest, "MAX_SLOPE": mesh.steepest}
         for key, text in (
             ("MAX_DEVIATION", "mm from its lowest to its highest"),
             ("MAX_SLOPE", "mm per mm steep"),
         ):
-            most = value(call.command, given, key, np.inf)
+            most = value(call.command, given, key, math.inf)
             if found[key] > most:
                 raise WordError(f"the mesh is {found[key]:.4f} {text}; {key} allows {most:g}")
         return Immediate(("the mesh is within the limits",))
@@ -433,8 +434,16 @@ def _pair(numbers: Sequence[Any]) -> Place:
     return float(x), float(y)
 
 
-def _rows(heights: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[Value]:
-    return [[round(float(height), 6) for height in row] for row in heights]
+def _heights(rows: Sequence[Sequence[Any]]) -> Heights:
+    """Return ROWS as heights; raises TypeError, ValueError."""
+    heights = tuple(tuple(float(height) for height in row) for row in rows)
+    if not heights or len(set(map(len, heights))) != 1:
+        raise ValueError("the rows of a mesh are not equally long")
+    return heights
+
+
+def _rows(heights: Heights) -> list[Value]:
+    return [[round(height, 6) for height in row] for row in heights]
 
 
 def _told(mesh: Mesh) -> dict[str, Value]:
@@ -457,9 +466,3 @@ def _parameters(mesh: Mesh) -> dict[str, Value]:
         "algo": mesh.algorithm,
         "tension": mesh.tension,
     }
-
-
-def _steepest(mesh: Mesh) -> float:
-    """Return the greatest change between neighbouring points, mm per mm."""
-    across, along = (np.abs(np.diff(mesh.heights, axis=axis)).max() for axis in (1, 0))
-    return float(max(across / mesh.spacing[0], along / mesh.spacing[1]))

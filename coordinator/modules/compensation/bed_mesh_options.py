@@ -5,8 +5,6 @@ import re
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-import numpy as np
-
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import BadValue, BoolOption, ChoiceOption, FloatOption, IntOption, Option
 from coordinator.config.sections.bounds import MAX_POSITION
@@ -15,8 +13,8 @@ from coordinator.modules.base import Build
 from coordinator.modules.compensation.mesh import (
     BICUBIC,
     LAGRANGE,
-    Floats,
     Grid,
+    Heights,
     Mesh,
     Place,
     Region,
@@ -234,7 +232,7 @@ class Fade:
         """Return it as a surface needs it for MESH, looked up Z_OFFSET higher."""
         if self.end <= self.start:
             return NO_FADE
-        target = float(mesh.heights.mean()) if self.target is None else self.target
+        target = mesh.mean if self.target is None else self.target
         return (self.start - z_offset, self.end - z_offset, target)
 
 
@@ -250,7 +248,7 @@ class MeshSettings:
     zero: Place | None
     margin: float
 
-    def mesh(self, grid: Grid, algorithm: str, heights: Floats) -> Mesh:
+    def mesh(self, grid: Grid, algorithm: str, heights: Heights) -> Mesh:
         """Return the mesh of HEIGHTS of GRID."""
         return Mesh(heights, grid.minimum, grid.maximum, algorithm, self.tension, self.pps)
 
@@ -334,10 +332,10 @@ def _regions(build: Build) -> tuple[Region, ...]:
 def read_profile(build: Build) -> Mesh:
     """Return the mesh of a named section; raises ConfigError."""
     build.get(VERSION)
-    heights = np.array(build.get(POINTS))
+    heights = build.get(POINTS)
     counts = (build.get(X_COUNT), build.get(Y_COUNT))
-    if heights.shape != counts[::-1]:
-        rows, columns = heights.shape
+    rows, columns = len(heights), len(heights[0])
+    if (columns, rows) != counts:
         raise build.reader.bad(
             POINTS, f"{rows} rows of {columns}; x_count and y_count say {counts[1]} rows of {counts[0]}"
         )

@@ -4,8 +4,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.builtins.machine import follow_surface
@@ -19,7 +17,7 @@ from coordinator.modules.levelling.surfaces import Plane, fit_plane
 from coordinator.modules.probes.probe import Measured, Probe
 from coordinator.motion.specs import MotionLimits
 from coordinator.motion.steps.errors import StepError
-from coordinator.motion.steps.surface import Surface
+from coordinator.motion.steps.surface import Surface, surface_nodes
 from coordinator.runtime.module_context import ModuleContext
 
 STEEPEST: Final = 0.1
@@ -78,10 +76,10 @@ class Tilt:
     def surface(self, limits: MotionLimits) -> Surface:
         """Return it as far as LIMITS let the head go; raises StepError where it is too steep."""
         low, high = limits.position_min[:2], limits.position_max[:2]
-        nodes = np.array(
-            [[(self.height(x, y), self.x, self.y, 0.0) for x in (low[0], high[0])] for y in (low[1], high[1])]
-        )
-        return Surface((low[0], low[1]), (high[0] - low[0], high[1] - low[1]), nodes)
+        nodes = [
+            [(self.height(x, y), self.x, self.y, 0.0) for x in (low[0], high[0])] for y in (low[1], high[1])
+        ]
+        return Surface((low[0], low[1]), (high[0] - low[0], high[1] - low[1]), surface_nodes(nodes))
 
 
 class BedTilt(Module):

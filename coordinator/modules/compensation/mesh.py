@@ -6,18 +6,21 @@ point is TENSION times the difference of its neighbours; an even tilt stays one,
 """
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from coordinator.motion.steps.surface import NO_FADE, Surface
+from coordinator.kinematics.geometry import fit_point
+from coordinator.motion.steps.surface import NO_FADE, Surface, surface_nodes
 
 Place = tuple[float, float]
 """X and Y, mm."""
-Floats = NDArray[np.float64]
+Heights = tuple[tuple[float, ...], ...]
+"""Rows of X, mm."""
+Weights = Sequence[tuple[int, float]]
+"""Of a node: numbers of points along an axis, with how much each counts."""
 
 LAGRANGE: Final = "lagrange"
 BICUBIC: Final = "bicubic"
@@ -48,7 +51,7 @@ def fitting_algorithm(wanted: str, counts: tuple[int, int]) -> str:
 class Mesh:
     """Heights (mm), rows of X, evenly from MINIMUM to MAXIMUM."""
 
-    heights: Floats
+    heights: Heights
     minimum: Place
     maximum: Place
     algorithm: str = LAGRANGE
@@ -59,8 +62,7 @@ class Mesh:
     @property
     def counts(self) -> tuple[int, int]:
         """Points along X and along Y."""
-        rows, columns = self.heights.shape
-        return columns, rows
+        return len(self.heights[0]), len(self.heights)
 
     @property
     def spacing(self) -> Place:
@@ -70,61 +72,101 @@ class Mesh:
             (self.maximum[1] - self.minimum[1]) / (self.counts[1] - 1),
         )
 
+    @property
+    def lowest(self) -> float:
+        """The least height, mm."""
+        return min(map(min, self.heights))
+
+    @property
+    def highest(self) -> float:
+        """The greatest height, mm."""
+        return max(map(max, self.heights))
+
+    @property
+    def mean(self) -> float:
+        """Of all heights, mm."""
+        return sum(map(sum, self.heights)) / math.prod(self.counts)
+
+    @property
+    def steepest(self) -> float:
+        """The greatest change between neighbouring points, mm per mm."""
+        along_x = max(abs(b - a) for row in self.heights for a, b in pairwise(row))
+        along_y = max(
+            abs(b - a) for low, high in pairwise(self.heights) for a, b in zip(low, high, strict=True)
+        )
+        return max(along_x / self.spacing[0], along_y / self.spacing[1])
+
     def surface(self, fade: tuple[float, float, float] = NO_FADE, offset: Place = (0.0, 0.0)) -> Surface:
         """Return the surface; heights are looked up OFFSET further. Raises StepError when it is no bed's."""
-        plane = self._plane()
-        rest = self.heights - plane
-        (value_x, slope_x, parts), (value_y, slope_y, _) = (self._along(count) for count in self.counts)
+        # Heights above the nearest plane: so an even tilt stays one, whatever the tension.
+        z, by_column, by_row = self._plane()
+        rest = [
+            [height - (z + by_column * column + by_row * row) for column, height in enumerate(heights)]
+            for row, heights in enumerate(self.heights)
+        ]
+        along_x, along_y = (self._along(count) for count in self.counts)
+        parts = LAGRANGE_PARTS if self.algorithm == LAGRANGE else 1
         width, depth = self.spacing
-        slope_x, slope_y = slope_x / width, slope_y / depth
-        nodes = np.stack(
-            (
-                value_y @ rest @ value_x.T,
-                value_y @ rest @ slope_x.T,
-                slope_y @ rest @ value_x.T,
-                slope_y @ rest @ slope_x.T,
-            ),
-            axis=-1,
-        )
-        nodes[..., 0] += self._plane(parts)
-        nodes[..., 1] += (plane[0, -1] - plane[0, 0]) / (self.maximum[0] - self.minimum[0])
-        nodes[..., 2] += (plane[-1, 0] - plane[0, 0]) / (self.maximum[1] - self.minimum[1])
+        nodes = [
+            [
+                (
+                    _sum(rest, value_y, value_x) + z + by_column * column / parts + by_row * row / parts,
+                    (_sum(rest, value_y, slope_x) + by_column) / width,
+                    (_sum(rest, slope_y, value_x) + by_row) / depth,
+                    _sum(rest, slope_y, slope_x) / (width * depth),
+                )
+                for column, (value_x, slope_x) in enumerate(along_x)
+            ]
+            for row, (value_y, slope_y) in enumerate(along_y)
+        ]
         origin = (self.minimum[0] - offset[0], self.minimum[1] - offset[1])
-        return Surface(origin, (width / parts, depth / parts), nodes, fade)
+        return Surface(origin, (width / parts, depth / parts), surface_nodes(nodes), fade)
 
-    def fine_heights(self) -> Floats:
+    def fine_heights(self) -> Heights:
         """Return the heights of the surface with ``pps`` more points between two measured ones."""
         surface = self.surface()
-        columns, rows = (
-            (count - 1) * (more + 1) + 1 for count, more in zip(self.counts, self.pps, strict=True)
+        xs, ys = (
+            [low + (high - low) * i / ((count - 1) * (more + 1)) for i in range((count - 1) * (more + 1) + 1)]
+            for low, high, count, more in zip(self.minimum, self.maximum, self.counts, self.pps, strict=True)
         )
-        xs = np.linspace(self.minimum[0], self.maximum[0], columns)
-        ys = np.linspace(self.minimum[1], self.maximum[1], rows)
-        return np.array([[surface.motor_z(x, y, 0.0) for x in xs] for y in ys])
+        return tuple(tuple(surface.motor_z(x, y, 0.0) for x in xs) for y in ys)
 
-    def _plane(self, parts: int = 1) -> Floats:
-        """Return the plane nearest to the heights, at the points or PARTS times as close."""
+    def _plane(self) -> tuple[float, float, float]:
+        """Return the plane nearest to the heights: at the first point, its rise by column and by row."""
         columns, rows = self.counts
-        x, y = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
-        terms = np.stack((np.ones_like(x), x, y), axis=-1).reshape(-1, 3)
-        factors = np.linalg.lstsq(terms, self.heights.reshape(-1), rcond=None)[0]
-        fine_x = np.linspace(-1, 1, (columns - 1) * parts + 1)
-        fine_y = np.linspace(-1, 1, (rows - 1) * parts + 1)
-        plane: Floats = factors[0] + factors[1] * fine_x + factors[2] * fine_y[:, None]
-        return plane
+        terms = [(1.0, float(column), float(row)) for row in range(rows) for column in range(columns)]
+        return fit_point(terms, [height for row in self.heights for height in row])
 
-    def _along(self, count: int) -> tuple[Floats, Floats, int]:
-        """Return matrices from COUNT heights in a row to nodes' heights and slopes; nodes per point."""
+    def _along(self, count: int) -> list[tuple[Weights, Weights]]:
+        """Return, for each node along an axis of COUNT points, the weights of its height and its slope."""
         if self.algorithm == LAGRANGE:
-            at = np.arange((count - 1) * LAGRANGE_PARTS + 1) / LAGRANGE_PARTS
-            powers = np.arange(count)
-            known = np.linalg.inv(np.vander(powers.astype(float), count, increasing=True))
-            slopes = np.zeros((len(at), count))
-            slopes[:, 1:] = powers[1:] * np.vander(at, count - 1, increasing=True)
-            return np.vander(at, count, increasing=True) @ known, slopes @ known, LAGRANGE_PARTS
-        slopes = self.tension * (np.eye(count, k=1) - np.eye(count, k=-1))
-        slopes[0, :2] = slopes[-1, -2:] = (-2 * self.tension, 2 * self.tension)
-        return np.eye(count), slopes, 1
+            return [_lagrange(i / LAGRANGE_PARTS, count) for i in range((count - 1) * LAGRANGE_PARTS + 1)]
+        found: list[tuple[Weights, Weights]] = []
+        for i in range(count):
+            before, after = max(i - 1, 0), min(i + 1, count - 1)
+            slope = self.tension * 2 / (after - before)
+            found.append((((i, 1.0),), ((before, -slope), (after, slope))))
+        return found
+
+
+def _sum(rest: Sequence[Sequence[float]], rows: Weights, columns: Weights) -> float:
+    return sum(by_y * by_x * rest[row][column] for row, by_y in rows for column, by_x in columns)
+
+
+def _lagrange(at: float, count: int) -> tuple[Weights, Weights]:
+    """Return the weights of COUNT points in the polynomial through them and in its slope, at a place.
+
+    The points are 0, 1, 2, …: the basis polynomials of Lagrange, and their derivatives by the product rule.
+    """
+    values, slopes = [], []
+    for j in range(count):
+        factors = [((at - m) / (j - m), 1 / (j - m)) for m in range(count) if m != j]
+        value, slope = 1.0, 0.0
+        for factor, derivative in factors:
+            value, slope = value * factor, slope * factor + value * derivative
+        values.append((j, value))
+        slopes.append((j, slope))
+    return values, slopes
 
 
 # ------------------------------------------------------------------------------------- where it is measured
@@ -195,7 +237,7 @@ class Grid:
                 found |= dict.fromkeys(self.probed(self.point(row, column)))
         return list(found)
 
-    def heights(self, measured: Callable[[Place], float]) -> Floats:
+    def heights(self, measured: Callable[[Place], float]) -> Heights:
         """Return the heights of all points from what was MEASURED at ``places``.
 
         On a round bed a point beyond the edge is as high as the last one of its row. Raises ValueError when
@@ -210,11 +252,18 @@ class Grid:
                 raise ValueError(
                     f"nothing of the mesh's row at Y {points[0][1]:g} can be probed: faulty regions cover it"
                 )
-            heights = np.interp(
-                range(len(points)), there, [sum(known[column]) / len(known[column]) for column in there]
-            )
-            rows.append(heights)
-        return np.array(rows)
+            means = [sum(known[column]) / len(known[column]) for column in there]
+            rows.append(tuple(_between(there, means, column) for column in range(len(points))))
+        return tuple(rows)
+
+
+def _between(columns: Sequence[int], heights: Sequence[float], at: int) -> float:
+    """Return the height at a column, on straight lines between known ones; beyond them it is level."""
+    after = bisect_right(columns, at)
+    if after in (0, len(columns)):
+        return heights[min(after, len(columns) - 1)]
+    low, high = columns[after - 1], columns[after]
+    return heights[after - 1] + (heights[after] - heights[after - 1]) * (at - low) / (high - low)
 
 
 def adapted(grid: Grid, areas: Sequence[Sequence[Place]], margin: float) -> Grid:

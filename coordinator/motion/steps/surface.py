@@ -1,43 +1,45 @@
 """The shape of a bed, as step generation follows it (the manual is step_surface.h)."""
 
 import math
+from array import array
+from collections.abc import Sequence
+from itertools import chain
 from typing import Any, Final
-
-import numpy as np
-from numpy.typing import NDArray
 
 from coordinator.motion.steps._steps import ffi, lib
 from coordinator.motion.steps.errors import StepError
 
 NODES_MAX: Final = int(lib.STEP_SURFACE_POINTS)
+_NODE_VALUES: Final = 4
 NO_FADE: Final = (math.inf, math.inf, 0.0)
 
 
 class Surface:
     """A bicubic surface over X and Y, added to Z; never changed.
 
-    NODES: rows of X, 2 to 256 nodes both ways, of four values each: height (mm), its slopes by X and by Y,
-    its twist (by both, 1/mm). FADE_MM: the planned Z up to which all of it acts, the one from which only the
-    third value is added, and that (infinite: all acts at any height). Raises StepError when it can be no
-    bed's.
+    NODES (``surface_nodes``): rows of X, 2 to 256 nodes both ways, of four doubles each: height (mm), its
+    slopes by X and by Y, its twist (by both, 1/mm). FADE_MM: the planned Z up to which all of it acts, the
+    one from which only the third value is added, and that (infinite: all acts at any height). Raises
+    StepError when it can be no bed's.
     """
 
     def __init__(
         self,
         origin_mm: tuple[float, float],
         spacing_mm: tuple[float, float],
-        nodes: NDArray[np.float64],
+        nodes: "memoryview[float]",
         fade_mm: tuple[float, float, float] = NO_FADE,
     ) -> None:
         self.origin_mm = origin_mm
         """X and Y of the first node."""
         self.spacing_mm = spacing_mm
         """Of nodes along X and along Y."""
-        self.nodes = np.ascontiguousarray(nodes, dtype=np.float64)
+        self.nodes = nodes
         self.fade_mm = fade_mm
-        self._memory = ffi.from_buffer("double[]", self.nodes.data)
+        self._memory = ffi.from_buffer("double[]", nodes)
         grid: Any = ffi.new("struct step_surface *")
-        grid.points_y, grid.points_x = self.nodes.shape[:2]
+        rows, columns, _ = nodes.shape or (0, 0, 0)
+        grid.points_y, grid.points_x = rows, columns
         grid.from_x, grid.from_y = origin_mm
         grid.step_x, grid.step_y = spacing_mm
         grid.fade_from, grid.fade_to, grid.fade_target = fade_mm
@@ -50,7 +52,6 @@ class Surface:
                 " at least 0.1 mm apart, whose height nowhere changes by more than 0.5 mm per mm, also where"
                 " it fades; probe the bed again, or let it fade over more height"
             )
-        rows, columns = self.nodes.shape[:2]
         self._patches: Any = ffi.new("double[]", 16 * (rows - 1) * (columns - 1))
         lib.step_surface_make_patches(self.grid, self._patches)
         self.grid.patches = self._patches
@@ -67,3 +68,9 @@ class Surface:
     def planned_z(self, x: float, y: float, motor_z: float) -> float:
         """Return the planned Z of a place to which the motors went, mm."""
         return float(lib.step_surface_planned_z(self.grid, x, y, motor_z))
+
+
+def surface_nodes(rows: Sequence[Sequence[Sequence[float]]]) -> "memoryview[float]":
+    """Return ROWS of nodes as ``Surface`` takes them."""
+    values = array("d", chain.from_iterable(chain.from_iterable(rows)))
+    return memoryview(values).cast("B").cast("d", (len(rows), len(rows[0]), _NODE_VALUES))

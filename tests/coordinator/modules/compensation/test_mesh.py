@@ -1,6 +1,7 @@
 """Meshes as surfaces: through their points, exact for what they can express, and where they are probed."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +21,9 @@ from coordinator.modules.compensation.mesh import (
 FIRST, LAST = (10.0, 20.0), (190.0, 170.0)
 
 
-def mesh_of(height: object, columns: int, rows: int, algorithm: str = LAGRANGE, tension: float = 0.2) -> Mesh:
+def mesh_of(height: Any, columns: int, rows: int, algorithm: str = LAGRANGE, tension: float = 0.2) -> Mesh:
     x, y = np.meshgrid(np.linspace(FIRST[0], LAST[0], columns), np.linspace(FIRST[1], LAST[1], rows))
-    return Mesh(height(x, y), FIRST, LAST, algorithm, tension)  # type: ignore[operator]
+    return Mesh(tuple(map(tuple, height(x, y).tolist())), FIRST, LAST, algorithm, tension)
 
 
 def worst(mesh: Mesh, height: object) -> float:
@@ -72,15 +73,15 @@ def test_it_goes_through_all_points_with_continuous_slopes(algorithm: str, count
     x, width = FIRST[0] + mesh.spacing[0], 1e-5
     before, here, behind = (surface.motor_z(x + step, 77.0, 0.0) for step in (-width, 0.0, width))
     assert here - before == pytest.approx(behind - here, abs=1e-9)
-    fine = mesh.fine_heights()
+    fine = np.array(mesh.fine_heights())
     assert fine.shape == ((counts[1] - 1) * 3 + 1, (counts[0] - 1) * 3 + 1)
-    assert fine[::3, ::3] == pytest.approx(mesh.heights, abs=1e-12)
+    assert fine[::3, ::3] == pytest.approx(np.array(mesh.heights), abs=1e-12)
 
 
 def test_fade_and_offsets() -> None:
     mesh = mesh_of(tilted, 3, 3)
     assert Fade(1, 0, None).of(mesh) == (math.inf, math.inf, 0.0)
-    assert Fade(1, 11, None).of(mesh) == pytest.approx((1, 11, mesh.heights.mean()))
+    assert Fade(1, 11, None).of(mesh) == pytest.approx((1, 11, np.mean(mesh.heights)))
     fade = Fade(1, 11, 0.0).of(mesh, z_offset=0.5)
     assert fade == (0.5, 10.5, 0.0)
     surface = mesh.surface(fade)
@@ -132,8 +133,8 @@ def test_a_round_bed_is_probed_inside_and_filled_outside() -> None:
     assert len(places) == 13
     assert all(math.hypot(*place) <= 50 for place in places)
     heights = grid.heights(lambda place: place[0] + place[1])
-    assert heights[0].tolist() == [-50] * 5
-    assert heights[1].tolist() == [-50, -50, -25, 0, 0]
+    assert heights[0] == (-50,) * 5
+    assert heights[1] == (-50, -50, -25, 0, 0)
 
 
 def test_a_faulty_region_is_measured_around() -> None:
@@ -149,8 +150,8 @@ def test_a_faulty_region_is_measured_around() -> None:
     assert {(5, 10), (12, 10), (10, 5), (10, 14)} <= set(places)
     heights = grid.heights(height)
     assert set(asked) == set(places)
-    assert heights[1, 1] == pytest.approx((5 + 12 + 10 + 10) / 4)
-    assert heights[4, 4] == pytest.approx((35 + 40) / 2), "beyond the mesh nothing is probed"
+    assert heights[1][1] == pytest.approx((5 + 12 + 10 + 10) / 4)
+    assert heights[4][4] == pytest.approx((35 + 40) / 2), "beyond the mesh nothing is probed"
 
 
 def test_a_row_without_any_point_is_refused() -> None:
