@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from coordinator.config.options import BadValue, Option
+from coordinator.support.lazy_numpy import Numbers, np
 
 HEIGHTS: Final = (0.1, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
 """Of a calibration, mm."""
@@ -31,7 +30,7 @@ class CoilDrift:
 
     curves: tuple[tuple[float, tuple[float, float, float]], ...]
 
-    def frequencies(self, celsius: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    def frequencies(self, celsius: float) -> Numbers:
         """Return the frequencies at the heights, Hz."""
         return np.array([a + b * celsius + c * celsius * celsius for _, (a, b, c) in self.curves])
 

@@ -11,8 +11,6 @@ from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequen
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any, ClassVar, Final, Protocol
 
-import numpy as np
-
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import ChoiceOption, FloatOption, IntOption, Option, SectionSpec, TextOption
 from coordinator.config.pins import PinOption
@@ -42,9 +40,10 @@ from coordinator.modules.probes.probe import (
     lift,
 )
 from coordinator.modules.probes.probe_commands import ProbeCommands
-from coordinator.modules.probes.reading_times import Numbers, ReadingTimes
+from coordinator.modules.probes.reading_times import ReadingTimes
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.probing import place_by_steps
+from coordinator.support.lazy_numpy import Numbers, np
 from nodes.devices.bulk_sensor import SensorError, checked
 from nodes.devices.endstop import EndstopState, SensorEndstop
 from nodes.devices.ldc1612 import Ldc1612

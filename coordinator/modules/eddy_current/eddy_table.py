@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from coordinator.config.options import BadValue, Option
+from coordinator.support.lazy_numpy import np
 from nodes.support.errors import CanductorError
 
 HEIGHTS: Final = (0.05, *(round(0.1 * number, 1) for number in range(1, 41)))

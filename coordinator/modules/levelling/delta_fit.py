@@ -12,11 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-
 from coordinator.kinematics.base import Point
 from coordinator.kinematics.delta import Delta
+from coordinator.support.lazy_numpy import Numbers, np
 
 Ways = tuple[float, float, float]
 """How far below its endstop each carriage is, mm."""
@@ -24,7 +22,6 @@ ROUNDS: Final = 30
 HALVINGS: Final = 10
 DIFFERENCE_MM: Final = 1e-4
 ENOUGH_MM: Final = 1e-9
-_Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +56,7 @@ def fit_delta(delta: Delta, heights: Sequence[Height], distances: Sequence[Dista
     """Return the delta near DELTA that explains HEIGHTS and DISTANCES best; ValueError without one."""
     count = 9 if distances else 6
 
-    def errors(change: _Floats) -> _Floats:
+    def errors(change: Numbers) -> Numbers:
         return _errors(_changed(delta, change), heights, distances)
 
     change = np.zeros(count)
@@ -94,7 +91,7 @@ def worst_height_mm(delta: Delta, heights: Sequence[Height]) -> float:
     return float(np.abs(_errors(delta, heights, ())).max())
 
 
-def _changed(delta: Delta, change: _Floats) -> Delta:
+def _changed(delta: Delta, change: Numbers) -> Delta:
     """Return DELTA with figures changed by so many mm: radius, angles a, b there, endstops, rods."""
     values = [float(value) for value in change] + [0.0] * (9 - len(change))
     a, b, c = (
@@ -111,7 +108,7 @@ def _changed(delta: Delta, change: _Floats) -> Delta:
     return replace(delta, radius=delta.radius + values[0], towers=(a, b, c))
 
 
-def _errors(delta: Delta, heights: Sequence[Height], distances: Sequence[Distance]) -> _Floats:
+def _errors(delta: Delta, heights: Sequence[Height], distances: Sequence[Distance]) -> Numbers:
     found = [nozzle_at(delta, height.ways)[2] - height.z for height in heights]
     found += [
         math.dist(nozzle_at(delta, one.first), nozzle_at(delta, one.second)) - one.length for one in distances

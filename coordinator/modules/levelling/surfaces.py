@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
 from coordinator.kinematics.base import Point
+from coordinator.support.lazy_numpy import Numbers, np
 
 Place = tuple[float, float]
 """X and Y, mm."""
@@ -48,7 +46,7 @@ def bilinear_heights(points: Sequence[Point], places: Sequence[Place]) -> list[f
     return [float(height) for height in heights]
 
 
-def _terms(places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _terms(places: Numbers) -> Numbers:
     x, y = places[:, 0], places[:, 1]
     return np.stack((np.ones_like(x), x, y, x * y), axis=1)
 

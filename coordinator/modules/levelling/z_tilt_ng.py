@@ -10,8 +10,6 @@ from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
-import numpy as np
-
 from coordinator.config.options import BadValue, FloatOption, IntOption, Option, SectionSpec
 from coordinator.gcode.commands import AtStandstill, Call, Immediate, Phases, ProgramContext, Reading
 from coordinator.gcode.events import Done
@@ -25,6 +23,7 @@ from coordinator.modules.levelling.surfaces import Place, Plane, fit_plane
 from coordinator.modules.levelling.z_tilt import POINTS, POSITIONS, check_places
 from coordinator.modules.probes.probe import Measuring, Probe
 from coordinator.runtime.machine import MachineStopped
+from coordinator.support.lazy_numpy import np
 from nodes.support.errors import CanductorError
 
 T = TypeVar("T")

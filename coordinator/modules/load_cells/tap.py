@@ -4,11 +4,12 @@ While the nozzle is pressed into the bed the force falls in proportion to the wa
 bed on it stays, but for a drift. The corner of these two lines is found by least squares.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
+from coordinator.support.lazy_numpy import Numbers, np
 
 LEAST: Final = 12
 """Readings of a lift."""
@@ -21,9 +22,7 @@ CLEAR: Final = 1.0
 """One line has to miss the readings, on average, by more than so many times what they scatter by the two."""
 LEAST_FALL: Final = 8.0
 """By so many times that a force has to change all the way, to be one."""
-_GOLDEN: Final = (np.sqrt(5) - 1) / 2
-
-Numbers = np.ndarray[Any, np.dtype[np.float64]]
+_GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
 
 @dataclass(frozen=True, slots=True)

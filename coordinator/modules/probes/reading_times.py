@@ -3,15 +3,11 @@
 import asyncio
 import contextlib
 from collections.abc import Sequence
-from typing import Any
-
-import numpy as np
 
 from coordinator.runtime.module_context import ModuleContext
+from coordinator.support.lazy_numpy import Numbers, np
 from nodes.devices.bulk_sensor import STATUS_S, BulkSensor, NumberedReading, R
 from nodes.support.errors import CanductorError
-
-Numbers = np.ndarray[Any, np.dtype[np.float64]]
 
 
 class ReadingTimes:
