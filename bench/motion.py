@@ -32,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps.steps import StepGenerator
+from coordinator.verification.planned import epochs
 from tests.coordinator.motion.exact_program import Planned, plan_program
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -256,7 +257,7 @@ def generation_cost(case: Generation, moves: Any) -> tuple[float, int, int]:
 
 
 def table_of_generation(planned: Planned) -> None:
-    moves = np.concatenate([piece for _, piece in planned.record.epochs() if len(piece)])
+    moves = np.concatenate([piece for _, piece in epochs(planned.record) if len(piece)])
     print(f"step generation alone, {len(moves):,} moves, best of {ROUNDS}, one core")
     for case in generation_cases():
         cpu, steps, queued = min(generation_cost(case, moves) for _ in range(ROUNDS))

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
+from coordinator.motion.moves import Move
 from coordinator.service.state.trace import MotionTrace
 
 HEADER: Final = ("time", "duration", "start_velocity", "acceleration", "start_position", "direction")
@@ -31,14 +32,14 @@ class MoveDump:
         rows: list[list[Any]] = []
         if not self._extruder or self._name == active:
             for move in trace.moves(self._until_s):
-                if self._until_s <= move["print_time"] < now_s:
+                if self._until_s <= move.print_time < now_s:
                     rows += self._rows(move)
         self._until_s = max(self._until_s, now_s)
         return rows
 
-    def _rows(self, move: Any) -> list[list[Any]]:
+    def _rows(self, move: Move) -> list[list[Any]]:
         """Return a row for each part of MOVE at a constant acceleration; none if it moves other axes only."""
-        place, ratio = move["start"].tolist(), move["ratio"].tolist()
+        place, ratio = list(move.start), list(move.ratio)
         if self._extruder:
             scale = abs(ratio[AXES])
             at, direction = [place[AXES], 0.0, 0.0], [1.0 if ratio[AXES] > 0 else -1.0, 0.0, 0.0]
@@ -47,11 +48,10 @@ class MoveDump:
             at, direction = place[:AXES], ratio[:AXES]
         if not scale:
             return []
-        time_s, speed, accel = float(move["print_time"]), float(move["start_v"]), float(move["accel"])
-        parts = ((move["accel_s"], accel), (move["cruise_s"], 0.0), (move["decel_s"], -accel))
+        time_s, speed, accel = move.print_time, move.start_v, move.accel
+        parts = ((move.accel_s, accel), (move.cruise_s, 0.0), (move.decel_s, -accel))
         rows: list[list[Any]] = []
-        for duration, acceleration in parts:
-            duration_s = float(duration)
+        for duration_s, acceleration in parts:
             if duration_s <= 0:
                 continue
             rows.append([time_s, duration_s, scale * speed, scale * acceleration, at, direction])

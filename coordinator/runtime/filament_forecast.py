@@ -4,25 +4,23 @@ Filament that was pulled back and comes again is hot already; only what goes far
 heat. Moves come from the thread that plans; heaters ask on the control loop, each about its own extruder.
 """
 
+from array import array
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
+from coordinator.motion.history._history import ffi, lib
 
-from coordinator.motion.planner._planner import ffi
-from coordinator.motion.trapezoid_array import TRAPEZOID
-
-if TYPE_CHECKING:
-    Chunk = tuple[NDArray[np.float64], NDArray[np.float64]]
-    """Print times, and how much new filament has passed by then, mm in all."""
+Chunk = tuple["array[float]", "array[float]"]
+"""Print times, and how much new filament has passed by then, mm in all."""
 
 KEPT_S: Final = 20.0
 """What is older than this before the newest move is forgotten."""
 CHUNKS_MAX: Final = 4096
 FILAMENT_AXIS: Final = 3
+_DOUBLE_BYTES: Final = 8
 
 
 class _Track:
@@ -62,22 +60,16 @@ class FilamentForecast:
         tracks = [self._tracks[name] for name in self._active if name in self._tracks]
         if not tracks or not count:
             return
-        data: Any = ffi.buffer(trapezoids, count * TRAPEZOID.itemsize)
-        moves = np.frombuffer(data, TRAPEZOID)
-        up, cruise, down = moves["accel_s"], moves["cruise_s"], moves["decel_s"]
-        way = moves["start_v"] * up + moves["accel"] * up**2 / 2 + moves["cruise_v"] * (cruise + down)
-        way -= moves["accel"] * down**2 / 2
-        pushed = moves["ratio"][:, FILAMENT_AXIS] * way
-        begin = moves["print_time"]
-        times = np.stack((begin, begin + up + cruise + down), axis=1).ravel()
+        moves = ffi.cast("struct trapezoid *", trapezoids)
         for track in tracks:
-            places = track.place_mm + np.cumsum(pushed)
-            farthest = np.maximum(np.maximum.accumulate(places), track.farthest_mm)
-            before = np.concatenate(((track.farthest_mm,), farthest[:-1]))
-            self._add(track, times, np.stack((before, farthest), axis=1).ravel())
-            track.place_mm, track.farthest_mm = float(places[-1]), float(farthest[-1])
+            times, passed = (array("d", bytes(_DOUBLE_BYTES * 2 * count)) for _ in range(2))
+            place, farthest = ffi.new("double *", track.place_mm), ffi.new("double *", track.farthest_mm)
+            columns = (ffi.from_buffer("double[]", column) for column in (times, passed))
+            lib.filament_passed(moves, count, place, farthest, *columns)
+            track.place_mm, track.farthest_mm = place[0], farthest[0]
+            self._add(track, times, passed)
 
-    def _add(self, track: _Track, times: "NDArray[np.float64]", passed: "NDArray[np.float64]") -> None:
+    def _add(self, track: _Track, times: "array[float]", passed: "array[float]") -> None:
         with self._lock:
             track.chunks.append((times, passed))
             while track.chunks[0][0][-1] < times[-1] - KEPT_S:
@@ -94,15 +86,20 @@ class FilamentForecast:
         with self._lock:
             chunks = list(track.chunks)
         if chunks:
-            end_s = min(end_s, float(chunks[-1][0][-1]))
+            end_s = min(end_s, chunks[-1][0][-1])
         if not chunks or end_s <= begin_s:
             return 0.0
         return (_passed(chunks, end_s) - _passed(chunks, begin_s)) / (end_s - begin_s)
 
 
-def _passed(chunks: "list[Chunk]", at_s: float) -> float:
+def _passed(chunks: list[Chunk], at_s: float) -> float:
     """Return how much had passed at AT_S; nothing more behind the last move that is known."""
     for times, passed in reversed(chunks):
         if at_s >= times[0]:
-            return float(np.interp(at_s, times, passed))
-    return float(chunks[0][1][0])
+            after = bisect_right(times, at_s)
+            if after == len(times):
+                return passed[-1]
+            begin_s, begin_mm = times[after - 1], passed[after - 1]
+            share = (at_s - begin_s) / (times[after] - begin_s)
+            return begin_mm + share * (passed[after] - begin_mm)
+    return chunks[0][1][0]

@@ -8,11 +8,10 @@ counts of the nodes give positions, independent of all that the host has planned
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-import numpy as np
-
 from coordinator.config.model import MachineDescription, StepperDescription
 from coordinator.kinematics.base import Point, Weights
 from coordinator.kinematics.dual_carriage import CarriageState
+from coordinator.kinematics.geometry import fit_point
 from coordinator.motion.planner.planner import Position
 
 _XYZ: Final = 3
@@ -95,7 +94,7 @@ class StepperPositions:
         if dual is not None and self._carriages is not None and stepper.name in self._of_carriage:
             axis = dual.carriages.axis
             axes[axis] = self._carriages.at(position[axis])[number] + offsets[axis]
-        return float(np.dot(weights, axes))
+        return sum(weight * at for weight, at in zip(weights, axes, strict=True))
 
     def _head_of_sums(self, positions: Mapping[str, float]) -> Point:
         """Return the position that fits all motors of the head best."""
@@ -104,7 +103,6 @@ class StepperPositions:
         for motor in self._described.motors:
             number, weights = self._of_carriage.get(motor.name, (primary, motor.weights))
             if number == primary:
-                rows.append(weights[:_XYZ])
+                rows.append(weights[:3])
                 sums.append(positions[motor.name])
-        x, y, z = np.linalg.lstsq(np.array(rows), np.array(sums), rcond=None)[0].tolist()
-        return (x, y, z)
+        return fit_point(rows, sums)

@@ -8,9 +8,6 @@ without a jump, each aimed at where the two clock estimators say the node's cloc
 from array import array
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nodes.clock.clock import HostTime, Ticks
 from nodes.clock.estimated_clock import EstimatedClock
 from nodes.clock.sync_pulse import PulseClock
@@ -69,14 +66,11 @@ class ClockMap:
         """Forget every piece but the one in force: a map that is only steered by stays small."""
         del self._ended[:]
 
-    def ticks(self, print_time: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the node's ticks at these print times, none before the first piece."""
-        last = self.last
-        pieces = np.array([*self._ended, last.print_time, last.ticks, last.ticks_per_s])
-        begins, ticks, rates = pieces.reshape(-1, 3).T
-        which = np.clip(np.searchsorted(begins, print_time, side="right") - 1, 0, None)
-        mapped: NDArray[np.float64] = ticks[which] + (print_time - begins[which]) * rates[which]
-        return mapped
+    @property
+    def pieces(self) -> list[ClockPiece]:
+        """All pieces, those that have ended first."""
+        ended = (ClockPiece(*self._ended[at : at + 3]) for at in range(0, len(self._ended), 3))
+        return [*ended, self.last]
 
 
 class TimeBase:

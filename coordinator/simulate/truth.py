@@ -10,6 +10,7 @@ from coordinator.config.model import StepperDescription
 from coordinator.simulate.checker import ExecutedSteps, concatenate
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.verification.expected import ExpectedSteps, Ints, expected_steps
+from coordinator.verification.planned import epochs
 from nodes.virtual.edge_log import steps_of
 
 
@@ -62,7 +63,7 @@ def _restarts(board: BoardTruth) -> Ints:
 def planned(record: PlanRecord, stepper: StepperDescription) -> ExpectedSteps:
     """Return the steps that the planned moves ask of STEPPER."""
     chunks: list[ExpectedSteps] = []
-    for position, moves in record.epochs():
+    for position, moves in epochs(record):
         origin = float(np.dot(stepper.weights, position))
         chunks += expected_steps(moves, stepper.weights, stepper.step_distance, origin)
     return concatenate(chunks)

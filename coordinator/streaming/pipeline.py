@@ -5,12 +5,9 @@ program and keeps no clock. Not thread-safe: one thread at a time.
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from coordinator.gcode.events import (
     AS_SOON_AS_POSSIBLE,
@@ -23,11 +20,11 @@ from coordinator.gcode.events import (
     WeightsChange,
 )
 from coordinator.gcode.machine_state import SHAPER_AXES, Shaper
+from coordinator.motion.moves import MOVE_BYTES, copied
 from coordinator.motion.planner.planner import Planner, Position
 from coordinator.motion.steps.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps.steps import StepGenerator
 from coordinator.motion.steps.surface import Surface
-from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.runtime.filament_forecast import FilamentForecast
 from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import MoveSource
@@ -55,29 +52,18 @@ class MotionSettings:
     """The shape of the bed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Segment:
-    """Consecutive trapezoids with one position declaration and one set of settings."""
-
-    start: Position
-    """Where the axes stand at its begin."""
-    declared: bool
-    """Whether they were declared to stand there; else they came there, and every stepper goes on as it is."""
-    moves: "NDArray[np.void]"
-    settings: MotionSettings
-
-
 @dataclass(slots=True)
 class PlanRecord:
-    """Record of what was planned, for a proof: trapezoids in order, and where positions were declared."""
+    """Record of what was planned, for a proof: moves in order, and where positions were declared."""
 
     start: Position
-    pieces: "list[NDArray[np.void]]" = field(default_factory=list)
+    pieces: list[bytes] = field(default_factory=list)
+    """Moves (motion/moves.py)."""
     declared: list[tuple[int, Position]] = field(default_factory=list)
-    """Before trapezoid number N the machine was declared to stand at a position."""
+    """Before move number N the machine was declared to stand at a position."""
     count: int = 0
     settings: list[tuple[int, MotionSettings]] = field(default_factory=list)
-    """Settings from trapezoid number N on."""
+    """Settings from move number N on."""
 
     def restart(self) -> None:
         """Forget all: something else has moved the machine."""
@@ -86,42 +72,14 @@ class PlanRecord:
         self.settings.clear()
         self.count = 0
 
-    def add(self, trapezoids: "NDArray[np.void]") -> None:
-        """Keep a copy."""
-        self.pieces.append(trapezoids.copy())
-        self.count += len(trapezoids)
+    def add(self, moves: bytes) -> None:
+        """Keep MOVES."""
+        self.pieces.append(moves)
+        self.count += len(moves) // MOVE_BYTES
 
-    def every(self) -> "NDArray[np.void]":
-        """Return all trapezoids."""
-        return np.concatenate(self.pieces) if self.pieces else np.empty(0, TRAPEZOID)
-
-    def epochs(self) -> "list[tuple[Position, NDArray[np.void]]]":
-        """Return the segments between declarations: where each begins, and its trapezoids."""
-        every = self.every()
-        cuts = [(0, self.start), *self.declared]
-        ends = [at for at, _ in cuts[1:]] + [len(every)]
-        return [(position, every[at:end]) for (at, position), end in zip(cuts, ends, strict=True)]
-
-    def segments(self) -> list[Segment]:
-        """Return the segments between declarations and changes, those with trapezoids, in order."""
-        found: list[Segment] = []
-        at, changes = 0, [*self.settings]
-        settings = MotionSettings({}, {}, {})
-        for position, moves in self.epochs():
-            begin, epoch_end = at, at + len(moves)
-            while at < epoch_end:
-                while changes and changes[0][0] <= at:
-                    settings = changes.pop(0)[1]
-                end = min([epoch_end, *(n for n, _ in changes[:1])])
-                start = _four(moves[at - begin]["start"].tolist()) if at > begin else position
-                found.append(Segment(start, at == begin, moves[at - begin : end - begin], settings))
-                at = end
-        return found
-
-
-def _four(values: Sequence[float]) -> Position:
-    x, y, z, e = values
-    return (x, y, z, e)
+    def every(self) -> bytes:
+        """Return all moves."""
+        return b"".join(self.pieces)
 
 
 class Pipeline:
@@ -293,7 +251,7 @@ class Pipeline:
                 if self._filament is not None:
                     self._filament.see_moves(waiting.pointer, taken)
                 if self._record is not None:
-                    self._record.add(waiting.array()[:taken])
+                    self._record.add(copied(waiting.pointer, taken))
                 self.planner.release(taken)
             if taken < waiting.count:
                 return False

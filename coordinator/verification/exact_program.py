@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from coordinator.motion.specs import StepperSpec
-from coordinator.streaming.pipeline import MotionSettings, Segment
+from coordinator.streaming.pipeline import MotionSettings
 from coordinator.verification.exact_bed import ExactBed
 from coordinator.verification.exact_path import Leg, Setting
 from coordinator.verification.exact_shapers import impulses
+from coordinator.verification.planned import Segment
 
 
 def program_legs(spec: StepperSpec, segments: Sequence[Segment]) -> list[Leg]:

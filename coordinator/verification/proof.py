@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from coordinator.runtime.timebase import ClockMap
 from coordinator.verification.expected import ExpectedSteps, Floats
+from coordinator.verification.planned import ticks_at
 
 EDGE_TOLERANCE_S = 25e-6
 """No step may be further than this from its planned time, clock error apart."""
@@ -133,7 +134,7 @@ def prove_stepper(
         position_executed += int(direction.sum(dtype=np.int64))
         planned = chunk.print_time[: len(clock)]
         wrong += int(np.count_nonzero(direction != chunk.direction[: len(clock)]))
-        band = (clock.astype(np.float64) - clock_map.ticks(planned)) / clock_map.clock_freq
+        band = (clock.astype(np.float64) - ticks_at(clock_map, planned)) / clock_map.clock_freq
         worst_band = max(worst_band, float(np.abs(band).max()))
         true = primary.print_time(truth(clock)) - planned
         worst_true = max(worst_true, float(np.abs(true).max()))
@@ -172,7 +173,7 @@ def prove_clock(
     moments = np.arange(span[0], span[1], 0.01)
     if not len(moments):
         return ClockProof(node, 0.0, 0.0)
-    ticks = clock_map.ticks(moments)
+    ticks = ticks_at(clock_map, moments)
     true = primary.print_time(truth(ticks.astype(np.uint64)))
     error = true - moments
     return ClockProof(node, float(np.sqrt(np.mean(error**2))), float(np.abs(error).max()))

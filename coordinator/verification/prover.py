@@ -13,6 +13,7 @@ from coordinator.verification.exact_program import program_legs
 from coordinator.verification.expected import ExpectedSteps, expected_steps
 from coordinator.verification.expected_curved import expected_curved
 from coordinator.verification.hardware import Hardware, NodeLog
+from coordinator.verification.planned import epochs, segments, ticks_at
 from coordinator.verification.proof import ClockProof, PrimaryClock, StepperProof, prove_clock, prove_stepper
 from coordinator.verification.true_position import PlaceProof, prove_places
 from nodes.virtual.firmware import firmware_dictionary
@@ -95,12 +96,12 @@ class Prover:
         )
 
     def _expected(self, stepper: StepperDescription) -> Iterator[ExpectedSteps]:
-        legs = program_legs(self._spec(stepper), self._record.segments())
+        legs = program_legs(self._spec(stepper), segments(self._record))
         if not all(leg.is_plain and leg.spec.weights == legs[0].spec.weights for leg in legs):
             yield from expected_curved(legs, self._outcome.maps[stepper.node].clock_freq)
             return
         weights = legs[0].spec.weights if legs else stepper.weights
-        for position, moves in self._record.epochs():
+        for position, moves in epochs(self._record):
             origin = float(np.dot(weights, position))
             yield from expected_steps(moves, weights, stepper.step_distance, origin)
 
@@ -120,7 +121,7 @@ class Prover:
 
     def _executed(self, stepper: StepperDescription, log: NodeLog) -> Iterator[tuple[Any, Any]]:
         sign = np.int8(-1 if stepper.dir_pin.invert else 1)
-        begin = self._outcome.maps[stepper.node].ticks(np.array([self._outcome.span[0] - BEFORE_S]))[0]
+        begin = ticks_at(self._outcome.maps[stepper.node], np.array([self._outcome.span[0] - BEFORE_S]))[0]
         for clock, direction in log.steps(
             self._pins[stepper.step_pin.name],
             self._pins[stepper.dir_pin.name],

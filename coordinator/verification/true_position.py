@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from coordinator.config.model import MachineDescription
 from coordinator.streaming.pipeline import PlanRecord
+from coordinator.verification.planned import epochs
 from nodes.virtual.plant import Axis
 from nodes.virtual.plant_page import Motor
 
@@ -82,7 +83,7 @@ def _steps_off(description: MachineDescription, axis: str) -> float:
 
 
 def _end_of(plan: PlanRecord) -> list[float]:
-    position, moves = plan.epochs()[-1]
+    position, moves = epochs(plan)[-1]
     if not len(moves):
         return [float(value) for value in position]
     last = moves[-1]

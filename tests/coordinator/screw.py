@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.tables.axis_table import AxisTable
+from coordinator.verification.planned import epochs
 from tests.coordinator.motion.exact_program import Planned, plan_program
 from tests.stages.printer_text import MCU, printer_section, section, stepper_section
 
@@ -111,7 +112,7 @@ def carry_out(
     config.write_text(machine_text(microsteps))
     program.write_text("\n".join(["G28", *lines, ""]))
     plan = plan_program(config, program, tables)
-    moves = np.concatenate([moves for _, moves in plan.record.epochs()])
+    moves = np.concatenate([moves for _, moves in epochs(plan.record)])
     begin = float(moves["print_time"][0])
     times = np.arange(begin, plan.print_time_s, every_s)
     motor = motor_mm(plan, "stepper_x", times)

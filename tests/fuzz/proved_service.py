@@ -15,9 +15,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from coordinator.assembly.load import load_machine
 from coordinator.demo.report import report_of
 from coordinator.demo.run import DemoOptions
@@ -27,7 +24,7 @@ from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.uploads import upload_method
-from coordinator.motion.trapezoid_array import TRAPEZOID
+from coordinator.motion.moves import MOVE_BYTES
 from coordinator.runtime.linux_host import LinuxHost
 from coordinator.service.api.methods import add_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
@@ -57,13 +54,13 @@ class FiledRecord(PlanRecord):
         super().restart()
         self._file.truncate(0)
 
-    def add(self, trapezoids: NDArray[np.void]) -> None:
-        self._file.write(trapezoids.tobytes())
-        self.count += len(trapezoids)
+    def add(self, moves: bytes) -> None:
+        self._file.write(moves)
+        self.count += len(moves) // MOVE_BYTES
 
-    def every(self) -> NDArray[np.void]:
+    def every(self) -> bytes:
         self._file.flush()
-        return np.fromfile(self._file.name, TRAPEZOID)
+        return Path(self._file.name).read_bytes()
 
 
 class Proved:

@@ -13,6 +13,7 @@ from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
+from coordinator.motion.trapezoid_array import array_of
 from coordinator.streaming.program_machine import machine_state
 from tests.stages.printer_text import PRINTER_CFG, write
 
@@ -85,7 +86,7 @@ class ProgramStage:
 
     def _drain(self) -> None:
         while (waiting := self.planner.take()).count:
-            for move in waiting.array():
+            for move in array_of(waiting):
                 ratio = [round(float(r), 9) for r in move["ratio"]]
                 self.moves.append(tuple(float(v) for v in move["start"]) + tuple(ratio))
             self.planner.release(waiting.count)

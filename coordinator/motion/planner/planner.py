@@ -670,8 +670,3 @@ class Planner:
     def moves_overflowed(self) -> int:
         """Moves planned before they were settled because the queue was full."""
         return int(self._core.moves_overflowed)
-
-
-def ffi_memory(trapezoids: Any, count: int) -> Any:
-    """Return the memory of COUNT trapezoids from a pointer to them; valid as long as they are."""
-    return ffi.buffer(trapezoids, count * ffi.sizeof("struct trapezoid"))

@@ -1,4 +1,4 @@
-"""What the planner takes and gives: feed results, refusals, trapezoids as numpy sees them."""
+"""What the planner takes and gives: feed results, refusals, trapezoids."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -6,12 +6,8 @@ from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from coordinator.motion.planner._planner import lib
 from coordinator.motion.specs import MotionLimits
-from coordinator.motion.trapezoid_array import TRAPEZOID
 
 Position = tuple[float, float, float, float]
 
@@ -139,10 +135,6 @@ class Trapezoids:
     """Buffer of the whole planner; keeps it alive."""
     offset: int
     """Of the first trapezoid in ``memory``, bytes."""
-
-    def array(self) -> "npt.NDArray[np.void]":
-        """Return a numpy view (dtype TRAPEZOID of trapezoid_array) of the same memory."""
-        return np.frombuffer(self.memory, TRAPEZOID, self.count, self.offset)
 
 
 def check_number(

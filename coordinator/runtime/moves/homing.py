@@ -11,11 +11,10 @@ plan says where it was at the moment at which the endstop was seen to switch.
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
-
-import numpy as np
 
 from coordinator.config.model import CanConnection, RailDescription, StepperDescription
 from coordinator.runtime.machine import Machine
@@ -422,7 +421,7 @@ def _not_found_cure(rail: RailDescription) -> str:
 
 def _way(leg: _Leg, move: SingleMove, steps: dict[str, int]) -> float:
     """Return how far a rail has gone, mm, by the STEPS of its steppers."""
-    return float(np.mean([steps[s.name] * s.step_distance / move.along(s) for s in leg.steppers]))
+    return sum(steps[s.name] * s.step_distance / move.along(s) for s in leg.steppers) / len(leg.steppers)
 
 
 def _switched(leg: _Leg, states: Mapping[str, TrsyncState]) -> bool:
@@ -434,7 +433,7 @@ def _switched(leg: _Leg, states: Mapping[str, TrsyncState]) -> bool:
 def _overshoot(move: SingleMove, stepper: StepperDescription, moved: int, to_trigger: float) -> Overshoot:
     planned = move.planned_steps(stepper, to_trigger)
     along = move.along(stepper)
-    steps = moved - int(np.floor(planned + 0.5))
+    steps = moved - math.floor(planned + 0.5)
     distance = (moved - planned) * stepper.step_distance / along
     return Overshoot(stepper.name, stepper.node, steps if along > 0 else -steps, distance)
 

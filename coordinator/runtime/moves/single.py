@@ -5,16 +5,15 @@ anything, and whatever is left of it when the steppers are stopped on their node
 """
 
 import asyncio
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-import numpy as np
-
 from coordinator.config.model import StepperDescription
+from coordinator.motion.moves import Move
 from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps.steps import StepGenerator
-from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.runtime.machine import Machine, link_of
 
 START_LEAD_S: Final = 0.4
@@ -44,7 +43,7 @@ class Ramp:
     @property
     def top_speed(self) -> float:
         """What is reached: a short way allows less than ``speed``."""
-        return float(min(self.speed, np.sqrt(self.accel * self.way_mm)))
+        return min(self.speed, math.sqrt(self.accel * self.way_mm))
 
     @property
     def ramp_s(self) -> float:
@@ -71,14 +70,21 @@ class Ramp:
             return self.way_mm - self.accel * rest * rest / 2
         return self.accel * self.ramp_s**2 / 2 + self.top_speed * (t - self.ramp_s)
 
-    def trapezoid(self, print_time: float, ratio: Ratio) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-        """Return the move as step generation takes it, beginning at PRINT_TIME where all axes are 0."""
-        move = np.zeros(1, TRAPEZOID)
-        move["print_time"], move["accel"], move["cruise_v"] = print_time, self.accel, self.top_speed
-        move["accel_s"] = move["decel_s"] = self.ramp_s
-        move["cruise_s"] = self.cruise_s
-        move["ratio"] = ratio
-        return move
+    def move(self, print_time: float, ratio: Ratio) -> Move:
+        """Return it as a move that begins at PRINT_TIME where all axes are 0."""
+        return Move(
+            print_time=print_time,
+            accel_s=self.ramp_s,
+            cruise_s=self.cruise_s,
+            decel_s=self.ramp_s,
+            start_v=0.0,
+            cruise_v=self.top_speed,
+            accel=self.accel,
+            start=(0.0, 0.0, 0.0, 0.0),
+            ratio=ratio,
+            pressure_advance=0.0,
+            line=0,
+        )
 
 
 def ratio_of(axis: str, direction: int) -> Ratio:
@@ -125,7 +131,7 @@ class SingleMove:
         for index, clock_map in enumerate(self._maps):
             piece = clock_map.last
             self._steps.set_clock_base(index, piece.print_time, round(piece.ticks), piece.ticks_per_s)
-        self._steps.append(ramp.trapezoid(self.begin_s, ratio), 1)
+        self._steps.append(ramp.move(self.begin_s, ratio).to_bytes(), 1)
 
     def print_time_now(self) -> float:
         """Return the present print time."""
@@ -171,7 +177,7 @@ class SingleMove:
         """Return how many mm a stepper moves per mm of way; 0 where that is not the same all the way."""
         if self._ways is not None:
             return self._ways.get(stepper.name, 0.0)
-        return float(np.dot(stepper.weights, self._ratio))
+        return sum(weight * share for weight, share in zip(stepper.weights, self._ratio, strict=True))
 
     def planned_steps(self, stepper: StepperDescription, way_mm: float) -> float:
         """Return where a stepper is after WAY_MM, in steps from the begin; a step is due at every half."""

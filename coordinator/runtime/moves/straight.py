@@ -2,8 +2,7 @@
 
 import math
 
-import numpy as np
-
+from coordinator.kinematics.geometry import fit_point
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.single import Ramp, SingleMove
 
@@ -27,5 +26,4 @@ async def move_by(machine: Machine, way: Way, speed: float, accel: float) -> Way
     ended_at = await machine.query_stepper_counts()
     motors = machine.description.motors
     made = [(ended_at[motor.name] - began_at[motor.name]) * motor.step_distance for motor in motors]
-    solved = np.linalg.lstsq(np.array([motor.weights[:3] for motor in motors]), np.array(made), rcond=None)[0]
-    return (float(solved[0]), float(solved[1]), float(solved[2]))
+    return fit_point([motor.weights[:3] for motor in motors], made)

@@ -4,15 +4,15 @@ import asyncio
 import time
 from collections.abc import Iterator, Sequence
 from itertools import islice
+from operator import attrgetter
 from typing import Any, Final
 
-import numpy as np
-
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
+from coordinator.motion.moves import Move
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.motion import Motion
 from coordinator.service.state.sent_commands import read_batch
-from coordinator.service.state.trace import KEEP_S, Moves
+from coordinator.service.state.trace import KEEP_S
 from coordinator.support.values import Value
 from nodes.dictionary.dictionary import Dictionary
 
@@ -57,14 +57,16 @@ def plot_methods(service: MachineService) -> Iterator[Method]:
         motion = service.motion or service.ready_motion()  # also of a machine that has stopped
         toolpath = motion.toolpath
         first = params["first"] if params["generation"] == toolpath.generation else 0
-        at, time_s, extrudes = toolpath.after(first, POINTS_AT_ONCE)
+        corners = toolpath.after(first, POINTS_AT_ONCE)
         return {
             "generation": toolpath.generation,
             "first": first,
             "count": len(toolpath),
-            **{axis: np.round(at[:, i], 3).tolist() for i, axis in enumerate("xyz")},
-            "print_time_s": np.round(time_s, 3).tolist(),
-            "extrudes": extrudes.tolist(),
+            "x": corners.x,
+            "y": corners.y,
+            "z": corners.z,
+            "print_time_s": corners.time_s,
+            "extrudes": corners.extrudes,
         }
 
     yield Method(
@@ -117,14 +119,14 @@ class _Sender:
 async def _dump(
     now_s: float,
     since_s: float,
-    moves: Moves,
+    moves: Sequence[Move],
     senders: Sequence[_Sender],
     names: dict[tuple[str, int | None], str],
 ) -> Value:
     kept = moves[-MOVES_MAX:]
     queues = [await _queue(sender, since_s, names) for sender in senders]
-    columns: dict[str, Value] = {name: kept[name].tolist() for name in _COLUMNS}
-    columns |= {name: kept[name].tolist() for name in ("start", "ratio")}
+    columns: dict[str, Value] = {name: list(map(attrgetter(name), kept)) for name in _COLUMNS}
+    columns |= {name: [list(getattr(move, name)) for move in kept] for name in ("start", "ratio")}
     truncated = len(kept) < len(moves) or any(full for _, full in queues)
     return {
         "now_s": now_s,

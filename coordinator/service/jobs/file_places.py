@@ -1,15 +1,15 @@
 """Where the lines of a job's file begin, for its progress: from the line carried out to the last one read."""
 
+import re
+from array import array
+from bisect import bisect_left
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-
 LINES_MAX: Final = 1 << 18
-"""Lines between what is carried out and what is read whose ends are kept (2 MB); those of further pieces are
+"""Lines between what is carried out and what is read whose ends are kept (1 MB); those of further pieces are
 estimated. Only files that consist of comments are read so far ahead."""
-_LINE_FEED: Final = 10
+_LINE_FEED: Final = re.compile(rb"\n")
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,21 +21,21 @@ class _Piece:
     size: int
     count: int
     """Line ends in it."""
-    ends: npt.NDArray[np.intp] | None
+    ends: "array[int] | None"
     """Where they are, from its first byte; None: not kept."""
 
     def end_of(self, index: int) -> int:
         """Return the place behind line end INDEX, counted since the beginning."""
         at = index - self.first
         if self.ends is not None:
-            return self.begin + int(self.ends[at]) + 1
+            return self.begin + self.ends[at] + 1
         return self.begin + (at + 1) * self.size // self.count
 
     def count_before(self, place: int) -> int:
         """Return how many line ends, since the beginning, lie before PLACE."""
         inside = min(max(place - self.begin, 0), self.size)
         if self.ends is not None:
-            return self.first + int(np.searchsorted(self.ends, inside))
+            return self.first + bisect_left(self.ends, inside)
         return self.first + inside * self.count // max(1, self.size)
 
 
@@ -52,7 +52,7 @@ class FilePlaces:
 
     def add(self, piece: bytes, begin: int) -> None:
         """Take note of PIECE, whose first byte is at BEGIN; pieces come in order, without gaps."""
-        ends = np.flatnonzero(np.frombuffer(piece, np.uint8) == _LINE_FEED)
+        ends = array("I", (found.start() for found in _LINE_FEED.finditer(piece)))
         last = self._pieces[-1] if self._pieces else None
         first = last.first + last.count if last is not None else 0
         kept = first - (self._pieces[0].first if self._pieces else 0) + len(ends) <= LINES_MAX

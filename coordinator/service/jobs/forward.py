@@ -16,6 +16,7 @@ from coordinator.modules.compensation.skew_correction import Skews
 from coordinator.modules.module_set import build_modules
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
+from coordinator.motion.history._history import ffi, lib
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.machine import Modules
 from coordinator.streaming.program_machine import machine_state
@@ -80,10 +81,8 @@ def _drain(planner: Planner) -> float:
     """Forget what is planned; return the greatest height at which anything was printed, mm."""
     high_mm = 0.0
     while (waiting := planner.take()).count:
-        moves = waiting.array()
-        ratio = moves["ratio"]
-        printing = moves["start"][(ratio[:, 3] > 0) & (ratio[:, :2] != 0).any(axis=1)]
-        high_mm = max(high_mm, float(printing[:, 2].max(initial=0.0)))
+        moves = ffi.cast("struct trapezoid *", waiting.pointer)
+        high_mm = max(high_mm, lib.highest_printed(moves, waiting.count))
         planner.release(waiting.count)
     return high_mm
 

@@ -4,17 +4,23 @@ The motion worker adds moves, the control loop reads; both see one immutable tup
 """
 
 import contextlib
+from bisect import bisect_right
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from coordinator.motion.planner.planner import ffi_memory
-from coordinator.motion.trapezoid_array import TRAPEZOID
+from coordinator.motion.moves import (
+    MOVE_BYTES,
+    Move,
+    begin_heights_mm,
+    begin_s,
+    copied,
+    end_s,
+    read_move,
+    read_moves,
+)
 from coordinator.streaming.move_source import Planned
 
 KEEP_S: Final = 10.0
@@ -24,8 +30,6 @@ FRESH_MAX: Final = 256
 """Batches of moves that wait for ``take_fresh``."""
 BATCH_BYTES_MAX: Final = 1 << 20
 """Per node."""
-
-Moves = NDArray[np.void]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,29 +61,30 @@ class MotionTrace:
     """A ``Witness`` that keeps what was planned and sent within the last KEEP_S, bounded in size."""
 
     def __init__(self, nodes: int) -> None:
-        self._pieces: tuple[Moves, ...] = ()
+        self._pieces: tuple[bytes, ...] = ()
+        """Moves, each piece with at least one."""
         self._batches: list[deque[bytes]] = [deque() for _ in range(nodes)]
         self._batch_bytes = [0] * nodes
         self._batches_seen = [0] * nodes
         self.sent = Sent()
         self.forget_before_s = 0.0
         """Print time; set by the control loop."""
-        self._fresh: deque[Moves] = deque(maxlen=FRESH_MAX)
+        self._fresh: deque[bytes] = deque(maxlen=FRESH_MAX)
 
     # ------------------------------------------------------------------------------------ as a witness
 
     def see_moves(self, trapezoids: Any, count: int) -> None:
-        """Copy moves; in the worker's thread."""
-        new = np.frombuffer(ffi_memory(trapezoids, count), TRAPEZOID).copy()
+        """Copy COUNT moves, at least one; in the worker's thread."""
+        new = copied(trapezoids, count)
         self._fresh.append(new)
         kept = list(self._pieces)
-        while len(kept) > 1 and _end_s(kept[0][-1]) < self.forget_before_s:
+        while len(kept) > 1 and end_s(kept[0], -1) < self.forget_before_s:
             del kept[0]  # the last one stays: it is where the machine stands
-        if kept and len(kept[-1]) + count <= PIECE_MOVES:
-            kept[-1] = _joined((kept[-1], new))
+        if kept and len(kept[-1]) + len(new) <= PIECE_MOVES * MOVE_BYTES:
+            kept[-1] += new
         else:
             kept.append(new)
-        while len(kept) > 1 and sum(map(len, kept)) > MOVES_MAX:
+        while len(kept) > 1 and sum(map(len, kept)) > MOVES_MAX * MOVE_BYTES:
             del kept[0]
         self._pieces = tuple(kept)
 
@@ -99,42 +104,41 @@ class MotionTrace:
     def at(self, print_time: float) -> Moment | None:
         """Return where the machine is at PRINT_TIME; None before all that is known."""
         for piece in reversed(self._pieces):
-            if piece[0]["print_time"] <= print_time:
-                index = int(np.searchsorted(piece["print_time"], print_time, side="right")) - 1
-                return _moment(piece[index], print_time)
+            count = len(piece) // MOVE_BYTES
+            index = bisect_right(range(count), print_time, key=lambda i: begin_s(piece, i)) - 1
+            if index >= 0:
+                return _moment(read_move(piece, index), print_time)
         return None
 
-    def moves(self, since_s: float) -> Moves:
+    def moves(self, since_s: float) -> list[Move]:
         """Return the moves that end after print time SINCE_S, oldest first."""
-        pieces = self._pieces
-        every = _joined(pieces)
-        ends = every["print_time"] + every["accel_s"] + every["cruise_s"] + every["decel_s"]
-        kept: Moves = every[ends > since_s]
-        return kept
+        return [move for piece in self._pieces_since(since_s) for move in read_moves(piece)]
 
     def heights(self, since_s: float) -> tuple[float, float] | None:
         """Return between which heights the moves begin that end after SINCE_S, mm; None: there is none."""
-        found: list[NDArray[np.float64]] = []
-        for piece in reversed(self._pieces):
-            ends = piece["print_time"] + piece["accel_s"] + piece["cruise_s"] + piece["decel_s"]
-            found.append(piece["start"][ends > since_s][:, 2])
-            if ends[0] <= since_s:
-                break
-        every = np.concatenate(found) if found else np.empty(0)
-        return (float(every.min()), float(every.max())) if len(every) else None
+        found = [begin_heights_mm(piece) for piece in self._pieces_since(since_s)]
+        return (min(map(min, found)), max(map(max, found))) if found else None
+
+    def _pieces_since(self, since_s: float) -> Iterator[bytes]:
+        """Yield the moves that end after print time SINCE_S, in pieces with at least one, oldest first."""
+        for piece in self._pieces:
+            count = len(piece) // MOVE_BYTES
+            first = bisect_right(range(count), since_s, key=lambda i: end_s(piece, i))
+            if first < count:
+                yield piece[first * MOVE_BYTES :]
 
     @property
     def fresh_batches(self) -> int:
         """How many batches of moves wait for ``take_fresh``."""
         return len(self._fresh)
 
-    def take_fresh(self) -> Moves:
+    def take_fresh(self) -> bytes:
         """Return the moves that came since this was called last; of too many the newest."""
-        new: list[Moves] = []
+        new: list[bytes] = []
         with contextlib.suppress(IndexError):
             while True:
                 new.append(self._fresh.popleft())
-        return _joined(new)
+        return b"".join(new)
 
     def batches(self, node: int) -> tuple[bytes, ...]:
         """Return what was sent to a moving node, oldest first."""
@@ -146,27 +150,15 @@ class MotionTrace:
         return total, tuple(islice(kept, max(0, len(kept) - (total - seen)), None))
 
 
-def _joined(pieces: Sequence[Moves]) -> Moves:
-    """Return PIECES as one array, in a fraction of what np.concatenate takes for records."""
-    return np.frombuffer(b"".join(piece.tobytes() for piece in pieces), TRAPEZOID)
-
-
-def _end_s(move: Any) -> float:
-    return float(move["print_time"] + move["accel_s"] + move["cruise_s"] + move["decel_s"])
-
-
-def _moment(move: Any, print_time: float) -> Moment:
+def _moment(move: Move, print_time: float) -> Moment:
     """Evaluate one move, or its end when it is over."""
-    fields = dict(zip(TRAPEZOID.names or (), move.item(), strict=True))  # one by one they cost three times
-    t = print_time - fields["print_time"]
-    accel, start_v, cruise_v = fields["accel"], fields["start_v"], fields["cruise_v"]
-    accel_s, cruise_s, decel_s = fields["accel_s"], fields["cruise_s"], fields["decel_s"]
-    moving = t < accel_s + cruise_s + decel_s
-    a, c, d = min(t, accel_s), min(max(t - accel_s, 0.0), cruise_s), max(t - accel_s - cruise_s, 0.0)
-    d = min(d, decel_s)
-    way = start_v * a + accel * a * a / 2 + cruise_v * c + cruise_v * d - accel * d * d / 2
-    speed = start_v + accel * a if t < accel_s else cruise_v - accel * d
-    x, y, z, e = (fields["start"] + fields["ratio"] * way).tolist()
+    t = print_time - move.print_time
+    moving = t < move.accel_s + move.cruise_s + move.decel_s
+    a, c = min(t, move.accel_s), min(max(t - move.accel_s, 0.0), move.cruise_s)
+    d = min(max(t - move.accel_s - move.cruise_s, 0.0), move.decel_s)
+    way = move.start_v * a + move.accel * a * a / 2 + move.cruise_v * (c + d) - move.accel * d * d / 2
+    speed = move.start_v + move.accel * a if t < move.accel_s else move.cruise_v - move.accel * d
     if not moving:
         speed = 0.0
-    return Moment((x, y, z, e), speed, fields["line"], moving, speed * float(fields["ratio"][3]))
+    x, y, z, e = (start + ratio * way for start, ratio in zip(move.start, move.ratio, strict=True))
+    return Moment((x, y, z, e), speed, move.line, moving, speed * move.ratio[3])

@@ -26,6 +26,7 @@ from coordinator.streaming.pipeline import Pipeline, PlanRecord
 from coordinator.streaming.program_machine import machine_state
 from coordinator.tables.axis_table import AxisTable
 from coordinator.verification.exact_program import program_legs
+from coordinator.verification.planned import segments
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
 from tests.coordinator.motion.exact_check import StepperProof, Verdict, check
 from tests.coordinator.motion.replay import Stream, replay_all
@@ -50,11 +51,11 @@ class Planned:
 
     def prove(self, windows: list[tuple[float, float]] | None = None) -> list[Verdict]:
         """Compare every stepper's steps with its exact motion, in WINDOWS of print time or everywhere."""
-        segments, streams = self.record.segments(), self.streams()
+        cut, streams = segments(self.record), self.streams()
         verdicts = []
         for spec in self.steppers:
             freq = self.nodes[spec.node].clock_freq
-            proof = StepperProof(program_legs(spec, segments))
+            proof = StepperProof(program_legs(spec, cut))
             verdicts.append(check(proof, streams[spec.name], freq, MAX_ERROR_S, windows))
         return verdicts
 

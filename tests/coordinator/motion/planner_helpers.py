@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.motion.planner.planner import FeedStatus, Planner
 from coordinator.motion.specs import MotionLimits
-from coordinator.motion.trapezoid_array import TRAPEZOID
+from coordinator.motion.trapezoid_array import TRAPEZOID, array_of
 
 GCODE = Path(__file__).parents[3] / ".." / "shared" / "data" / "gcode"
 LIMITS = MotionLimits(
@@ -47,7 +47,7 @@ def drain(planner: Planner) -> list[Array]:
     """Take and release everything that waits."""
     pieces = []
     while (batch := planner.take()).count:
-        pieces.append(batch.array().copy())
+        pieces.append(array_of(batch).copy())
         planner.release(batch.count)
     return pieces
 

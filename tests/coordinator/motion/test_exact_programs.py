@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.motion.steps.steps import MAX_ERROR_S
+from coordinator.verification.planned import segments
 from tests.coordinator.motion.exact_program import Planned, plan_program
 from tests.profiles import is_full
 
@@ -113,9 +114,9 @@ def test_every_step_is_right_when_the_machine_changes_on_the_way(tmp_path: Path,
     body = "\n".join(ZIGZAG)
     gcode.write_text("\n".join(["G28\nG90\nM83\nG1 Z3.3 F300", body, *(f"{c}\n{body}" for c in changes)]))
     plan = plan_program(CONFIG / f"{machine}.cfg", gcode)
-    segments = plan.record.segments()
-    assert len(segments) > 2
-    assert sum(len(stretch.moves) for stretch in segments) == plan.record.count
+    cut = segments(plan.record)
+    assert len(cut) > 2
+    assert sum(len(stretch.moves) for stretch in cut) == plan.record.count
     verdicts = plan.prove()
     for verdict in verdicts:
         assert verdict.outside == 0, f"{verdict.name} at {verdict.outside_s} s"

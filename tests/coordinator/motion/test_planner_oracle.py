@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.specs import MotionLimits
+from coordinator.motion.trapezoid_array import array_of
 from tests.coordinator.motion.planner_helpers import (
     LIMITS,
     Array,
@@ -141,10 +142,10 @@ def test_real_files(name: str) -> None:
             if line.startswith("G92"):
                 planner.set_gcode_position({"E": 0.0})
         while (batch := planner.take()).count:
-            pieces.append(batch.array().copy())
+            pieces.append(array_of(batch).copy())
             planner.release(batch.count)
     assert planner.flush()
-    pieces.append(planner.take().array().copy())
+    pieces.append(array_of(planner.take()).copy())
     t = np.concatenate(pieces)
     compare(t, language)
     check_invariants(t, end=planner.toolhead_position)

@@ -23,6 +23,7 @@ from coordinator.service.core.tables import TableService
 from coordinator.streaming.compensation import NO_CORRECTION, Compensation
 from coordinator.tables.axis_table import AxisTable, Direction, Unit
 from coordinator.tables.store import TableStore
+from coordinator.verification.planned import epochs
 from tests.coordinator.motion.exact_program import Planned, plan_program
 from tests.coordinator.motion.planner_helpers import LIMITS, homed_planner, planned
 from tests.coordinator.motion.steps_harness import NODES, E, X, Y, Z, stepper
@@ -107,7 +108,7 @@ def test_steps_come_when_the_corrected_axis_is_there(tmp_path: Path, impulses: I
     table = wavy(backlash=0)
     lines = [*([SHAPED] if len(impulses) > 1 else []), *workout(3, 6)]
     trial = carry_out(lines, Screw(), tmp_path, {"x": table})
-    moves = np.concatenate([moves for _, moves in trial.plan.record.epochs()])
+    moves = np.concatenate([moves for _, moves in epochs(trial.plan.record)])
     clock, direction, before = trial.plan.streams()["stepper_x"].expand()
     times = clock / trial.plan.nodes[trial.plan.steppers[0].node].clock_freq
     parts = [share * corrected_mm(moves, times - later_s, table) for share, later_s in impulses]

@@ -24,7 +24,7 @@ def plan() -> PlanRecord:
     move["accel_s"] = move["decel_s"] = 0.4
     move["accel"], move["cruise_v"], move["cruise_s"] = 25.0, 10.0, 0.6
     move["ratio"] = (1.0, 0.0, 0.0, 0.0)
-    record.add(move)
+    record.add(move.tobytes())
     return record
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from coordinator.motion.planner.planner import RING_TRAPEZOIDS, FaultKind, FeedStatus, Planner
+from coordinator.motion.trapezoid_array import array_of
 from tests.coordinator.motion.planner_helpers import (
     LIMITS,
     check_invariants,
@@ -59,7 +60,7 @@ def test_the_result_does_not_depend_on_when_trapezoids_are_taken() -> None:
     def take_some() -> None:
         batch = planner.take()
         count = rng.randint(0, min(batch.count, 700))
-        pieces.append(batch.array()[:count].copy())
+        pieces.append(array_of(batch)[:count].copy())
         planner.release(count)
 
     while (feed := planner.feed(text, start, len(text), final=True)).status is FeedStatus.FULL:
@@ -286,6 +287,6 @@ def test_a_view_outlives_the_planner() -> None:
     planner = homed_planner()
     planner.feed(b"G1 X10\n", 0, 7, final=True)
     assert planner.flush()
-    view = planner.take().array()
+    view = array_of(planner.take())
     del planner
     assert np.isfinite(view["print_time"]).all()

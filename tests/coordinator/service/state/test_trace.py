@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from coordinator.assembly.load import load_machine
+from coordinator.motion.moves import read_moves
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.core.motion import UNMOVED
 from coordinator.service.state.trace import BATCH_BYTES_MAX, MOVES_MAX, MotionTrace, Sent
@@ -89,12 +90,14 @@ def test_only_the_stretch_that_is_asked_for() -> None:
     planner, trace = planned(LINES)
     assert len(trace.moves(0.0)) == 5
     assert len(trace.moves(planner.print_time_end_s + 1e-6)) == 0
-    assert trace.moves(planner.print_time_end_s - 1e-3)["line"].tolist() == [5]
+    assert [move.line for move in trace.moves(planner.print_time_end_s - 1e-3)] == [5]
 
 
 def test_fresh_moves_are_taken_once() -> None:
     planner, trace = planned(LINES)
     fresh = trace.take_fresh()
-    assert len(fresh) == len(trace.moves(0.0)) > 0
+    assert [*read_moves(fresh)] == trace.moves(0.0)
+    assert trace.heights(0.0) == (0.0, 0.0)
+    assert fresh
     assert len(trace.take_fresh()) == 0
     assert planner.homed == "XYZ"
