@@ -9,14 +9,13 @@ they are.
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from operator import mul
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nodes.clock.clock import Ticks
+from nodes.support.linear import solve
 
 FADE_S: Final = 8.0
 """Chosen with simulated ramps of 20 ppm in 600 s: a shorter time follows their start faster, a longer one
@@ -78,10 +77,10 @@ class PulseLine:
         return self.offset_s + self.rate * t + self.curvature_per_s * bend_s * bend_s / 2
 
 
-def _noise(off_s: NDArray[np.float64]) -> float:
+def _noise(off_s: Sequence[float]) -> float:
     """Return the median deviation of readings, scaled to the standard deviation of a normal distribution."""
-    ranked, half = np.sort(off_s), len(off_s) // 2  # np.median takes ten times as long for so few values
-    return max(JITTER_FLOOR_S, 1.4826 * float(ranked[half] + ranked[~half]) / 2)
+    ranked, half = sorted(off_s), len(off_s) // 2
+    return max(JITTER_FLOOR_S, 1.4826 * (ranked[half] + ranked[~half]) / 2)
 
 
 class PulseFit:
@@ -91,7 +90,7 @@ class PulseFit:
         self._reference_hz = reference_hz
         self._freq_hz = freq_hz
         self._pairs: deque[tuple[Ticks, Ticks]] = deque(maxlen=PAIRS_MAX)
-        self._off_s: NDArray[np.float64]
+        self._off_s: list[float]
         """Deviation of the pairs from the newest fit."""
         self.line: PulseLine | None = None
         """The newest fit; None before the first pair."""
@@ -120,7 +119,7 @@ class PulseFit:
             if self._pairs and self._parted(self._pairs[-1], pair):
                 self._pairs.clear()
             self._pairs.append(pair)
-        self.line = self._fit(np.zeros(len(self._pairs))) if self._pairs else None
+        self.line = self._fit([0.0] * len(self._pairs)) if self._pairs else None
 
     def _parted(self, earlier: tuple[Ticks, Ticks], later: tuple[Ticks, Ticks]) -> bool:
         passed_s = (later[0] - earlier[0]) / self._reference_hz
@@ -132,27 +131,23 @@ class PulseFit:
         off_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
         return passed_s <= 0 or off_s > JUMP_S + RATE_PRIOR * passed_s
 
-    def _fit(self, off_s: NDArray[np.float64]) -> PulseLine:
+    def _fit(self, off_s: list[float]) -> PulseLine:
         """Fit the pairs, whose known deviations are OFF_S."""
         last_reference, last_ticks = self._pairs[-1]
-        pairs = np.array(self._pairs, dtype=np.int64)
-        t = (pairs[:, 0] - last_reference) / self._reference_hz
-        y = (pairs[:, 1] - last_ticks) / self._freq_hz - t
-        rows = np.stack([np.ones_like(t), t, t * t / 2], axis=1)
-        fade = np.exp(t / FADE_S)
-        hold = np.diag([0.0, RATE_PRIOR**-2, CURVATURE_PRIOR_PER_S**-2])
+        times = [(reference - last_reference) / self._reference_hz for reference, _ in self._pairs]
+        partings = [
+            (ticks - last_ticks) / self._freq_hz - t for (_, ticks), t in zip(self._pairs, times, strict=True)
+        ]
+        readings = [(t, t * t / 2, y, math.exp(t / FADE_S)) for t, y in zip(times, partings, strict=True)]
         noise_s = _noise(off_s)
         for _ in range(ROUNDS):
-            trust = np.minimum(1.0, (ROBUST * noise_s / np.maximum(off_s, JITTER_FLOOR_S)) ** 2)
-            weight = fade * trust / noise_s**2
-            normal = rows.T @ (rows * weight[:, None]) + hold
-            fitted = np.linalg.solve(normal, rows.T @ (weight * y))
-            off_s = np.abs(y - rows @ fitted)
+            normal, fitted = _weighted_parabola(readings, off_s, noise_s)
+            offset_s, rate, curvature_per_s = fitted
+            off_s = [abs(y - offset_s - rate * t - curvature_per_s * bend) for t, bend, y, _ in readings]
             noise_s = _noise(off_s)
         self._off_s = off_s
-        offset_s, rate, curvature_per_s = (float(value) for value in fitted)
-        ahead = np.array([1.0, REACH_S, REACH_S**2 / 2])
-        variance = float(ahead @ np.linalg.solve(normal, ahead))
+        ahead = (1.0, REACH_S, REACH_S**2 / 2)
+        variance = sum(map(mul, ahead, solve(normal, ahead)))
         return PulseLine(
             last_reference,
             last_ticks,
@@ -164,11 +159,35 @@ class PulseFit:
             CONFIDENCE * math.sqrt(variance) + noise_s,
         )
 
-    def _off_the_last_line(self) -> NDArray[np.float64]:
+    def _off_the_last_line(self) -> list[float]:
         """Return the deviation of pairs from the last fit, so that a late latch cannot bend the new one."""
         line, count = self.line, len(self._pairs)
         if line is None or count < SETTLE_PAIRS:
-            return np.zeros(count)
+            return [0.0] * count
         reference, ticks = self._pairs[-1]
         newest_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
-        return np.append(self._off_s, newest_s)[-count:]
+        return [*self._off_s, newest_s][-count:]
+
+
+def _weighted_parabola(
+    readings: Sequence[tuple[float, float, float, float]], off_s: Sequence[float], noise_s: float
+) -> tuple[list[list[float]], list[float]]:
+    """Return the matrix of the normal equations of READINGS, and their solution.
+
+    READINGS: time, half its square, value, weight. Those further OFF_S than usual lose weight.
+    """
+    limit_s = ROBUST * noise_s
+    weights = wt = wb = wtt = wtb = wbb = wy = wty = wby = 0.0
+    for (t, bend, y, fade), off in zip(readings, off_s, strict=True):
+        weight = fade if off <= limit_s else fade * (limit_s / max(off, JITTER_FLOOR_S)) ** 2
+        by_t, by_bend = weight * t, weight * bend
+        weights, wt, wb, wy = weights + weight, wt + by_t, wb + by_bend, wy + weight * y
+        wtt, wtb, wbb = wtt + by_t * t, wtb + by_t * bend, wbb + by_bend * bend
+        wty, wby = wty + by_t * y, wby + by_bend * y
+    scale = noise_s**-2
+    normal = [
+        [scale * weights, scale * wt, scale * wb],
+        [scale * wt, scale * wtt + RATE_PRIOR**-2, scale * wtb],
+        [scale * wb, scale * wtb, scale * wbb + CURVATURE_PRIOR_PER_S**-2],
+    ]
+    return normal, solve(normal, (scale * wy, scale * wty, scale * wby))
