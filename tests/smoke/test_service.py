@@ -73,6 +73,8 @@ def test_a_machine_is_served(machine: Hardware, tmp_path: Path) -> None:
         assert sent.status == 0, sent
         until(client, "job.state", "done")
         as_planned(client)
+        files = Path(f"/proc/{command.process.pid}/maps").read_text()
+        assert "numpy" not in files, "10 MB that a machine which prints has no use for"
         # Asked on the bus, the nodes are told apart by what their host knows.
         found = canductor("can", "nodes", "-i", "canductor", "-c", machine.folder / "bus", "--json")
         nodes = {node["uuid"]: node["state"] for node in json.loads(found.stdout.splitlines()[-1])["nodes"]}
