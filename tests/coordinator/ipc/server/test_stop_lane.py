@@ -608,6 +608,21 @@ def test_a_token_that_was_taken_away_stops_nothing(tmp_path: Path) -> None:
     run_page(tmp_path, None, lane, go, tokens=tokens_file(tmp_path))
 
 
+def test_a_session_under_a_foreign_name_stops_nothing(tmp_path: Path) -> None:
+    """Nobody can sign in there; if somebody could, it would not help."""
+    lane = Lane()
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in()
+        (session,) = paged.page._access.sessions
+        session.host = "evil.example"
+        data = paged.stop_request(Host="evil.example", Origin="http://evil.example")
+        request_stop(paged, lane, None, data).close()
+        assert lane.seen() == []
+
+    run_page(tmp_path, None, lane, go)
+
+
 def test_a_page_that_has_left_is_forgotten(tmp_path: Path) -> None:
     lane = Lane()
 
