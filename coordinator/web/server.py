@@ -2,26 +2,29 @@
 
 import asyncio
 import contextlib
+import functools
 import json
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from http import HTTPStatus
 from typing import Any, Final
 
 from aiohttp import WSMsgType, web
+from multidict import MultiMapping
 
 from coordinator.ipc.protocol.limits import EndReason
 from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.server.auth import Grant, digest_of
 from coordinator.ipc.server.connection import Connection
-from coordinator.ipc.server.server import ExternalGrant, IpcServer, tls_context
+from coordinator.ipc.server.server import ExternalGrant, IpcServer, StopCall, tls_context
 from coordinator.web.access import LINK_S, SESSION_S, PageAccess, PageSession, is_key_of
 from coordinator.web.files import PageFile, page_files
 from coordinator.web.http_server import HttpServer
 from coordinator.web.names import is_known_host, is_own_origin
 from coordinator.web.session_file import read_sessions, write_sessions
 from coordinator.web.settings import WebSettings
+from coordinator.web.stop_request import BODY_BYTES_MAX, STOP_PATH, parse_request, read_body
 from coordinator.web.websocket_frames import lines_in
 from coordinator.web.websocket_transport import WebSocketTransport
 from nodes.support.errors import CanductorError
@@ -40,6 +43,8 @@ REQUEST_S: Final = 30.0
 """A connection that is no WebSocket is closed after so long: who only fetches files is done by then."""
 HEARTBEAT_S: Final = 15.0
 """Between looks at whether a browser is still there."""
+CLIENT: Final = "the live page"
+"""As the page's script calls itself."""
 UNKNOWN: Final = ApiError(
     "bad_token",
     "This link or token is not known. A link works once, for "
@@ -59,6 +64,14 @@ HEADERS: Final = {
     "Cache-Control": "no-cache",
     "Server": "canductor",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a request is not carried out."""
+
+    status: HTTPStatus
+    error: ApiError
 
 
 class WebServer:
@@ -89,7 +102,12 @@ class WebServer:
         if settings.certificate is not None and settings.private_key is not None:
             context = await asyncio.to_thread(tls_context, settings.certificate, settings.private_key)
         self._http = HttpServer(
-            self._answer, connections_max=CONNECTIONS_MAX, connection_s=REQUEST_S, context=context
+            self._answer,
+            connections_max=CONNECTIONS_MAX,
+            connection_s=REQUEST_S,
+            context=context,
+            stop_lane=self._ipc.stop_lane,
+            find_stop=functools.partial(self._find_stop, asyncio.get_running_loop()),
         )
         try:
             await self._http.open(settings.host, settings.port)
@@ -154,10 +172,10 @@ class WebServer:
             except CanductorError as error:
                 self._on_notice(f"{error}; browsers need a new link after the next start")
 
-    def _session_of(self, request: web.BaseRequest) -> PageSession | None:
+    def _session_of(self, headers: MultiMapping[str]) -> PageSession | None:
         """Return the session of the browser that asks, None if it has none, or its token was taken away."""
-        host, time_s = _host(request), time.time()
-        for cookie in _cookies(request, self._cookie_name)[:COOKIES_MAX]:
+        host, time_s = _host(headers), time.time()
+        for cookie in _cookies(headers, self._cookie_name)[:COOKIES_MAX]:
             session = self._access.find(cookie, host, time_s)
             if session is not None and self._grant(session) is not None:
                 return session
@@ -169,6 +187,13 @@ class WebServer:
             return Grant("", session.scope)
         grant = self._ipc.grant_of(session.token)
         return None if grant is None else replace(grant, scope=min(grant.scope, session.scope))
+
+    def _check_key(self, session: PageSession, key: str) -> ExternalGrant | None:
+        """Return what the browser of SESSION that gives KEY may do; None: nothing."""
+        grant = self._grant(session)
+        if grant is None or session not in self._access.sessions or not is_key_of(session, key):
+            return None
+        return ExternalGrant(grant, session.token)
 
     @property
     def _cookie_name(self) -> str:
@@ -184,13 +209,15 @@ class WebServer:
             return await self._serve_socket(request)
         if request.path == LOGIN_PATH:
             return await self._sign_in(request)
+        if request.path == STOP_PATH:
+            return await self._stop(request)
         return self._serve_file(request)
 
     def _serve_file(self, request: web.BaseRequest) -> web.Response:
         if request.method not in ("GET", "HEAD"):
             return web.Response(status=405, headers={**HEADERS, "Allow": "GET, HEAD"})
         if request.path == SESSION_PATH:
-            return web.Response(status=204 if self._session_of(request) else 401, headers=HEADERS)
+            return web.Response(status=204 if self._session_of(request.headers) else 401, headers=HEADERS)
         file = self._files.get(request.path)
         if file is None:
             return web.Response(status=404, text="there is no such page\n", headers=HEADERS)
@@ -215,10 +242,10 @@ class WebServer:
             except ApiError as error:
                 self._refused += 1
                 return _fault(HTTPStatus.FORBIDDEN, UNKNOWN if error.code == UNKNOWN.code else error)
-        former = self._session_of(request)
+        former = self._session_of(request.headers)
         if former is not None:
             self._access.sign_out(former)
-        signed_in = self._access.sign_in(_host(request), scope, digest, time.time())
+        signed_in = self._access.sign_in(_host(request.headers), scope, digest, time.time())
         await self._save_sessions()
         headers = {**HEADERS, "Cache-Control": "no-store"}
         answer = web.json_response({"key": signed_in.key, "scope": scope.word}, headers=headers)
@@ -233,6 +260,52 @@ class WebServer:
         )
         return answer
 
+    async def _stop(self, request: web.BaseRequest) -> web.Response:
+        """Carry out an emergency stop that is a request of its own."""
+        if request.method != "POST":
+            return web.Response(status=405, headers={**HEADERS, "Allow": "POST"})
+        if request.content_length is None or request.content_length > BODY_BYTES_MAX:
+            return web.Response(status=413, headers=HEADERS)
+        judged = self._judge_stop(request.headers, await request.read(), _address(request))
+        if isinstance(judged, Refusal):
+            self._refused += 1
+            return _fault(judged.status, judged.error)
+        # No await from here to the answer: the stop lane would find the stop again.
+        return web.json_response(judged.carry_out(), headers={**HEADERS, "Cache-Control": "no-store"})
+
+    def _judge_stop(self, headers: MultiMapping[str], body: bytes, address: str) -> StopCall | Refusal:
+        """Return what a stop with HEADERS and BODY from ADDRESS does; in any thread.
+
+        It needs what a WebSocket needs, and its hello.
+        """
+        host = headers.get("Host", "")
+        if not is_known_host(host, self._names) or not is_own_origin(headers.get("Origin"), host):
+            return Refusal(
+                HTTPStatus.FORBIDDEN,
+                ApiError("not_allowed", "only the page of this server may stop the machine here"),
+            )
+        session = self._session_of(headers)
+        if session is None:
+            return Refusal(HTTPStatus.UNAUTHORIZED, ApiError("no_token", "this browser is not signed in"))
+        given = read_body(body)
+        if given is None:
+            return Refusal(HTTPStatus.BAD_REQUEST, ApiError("bad_message", "key is needed"))
+        grant = self._check_key(session, given.key)
+        if grant is None:
+            return Refusal(HTTPStatus.FORBIDDEN, ApiError("bad_token", "the key is not that of the session"))
+        try:
+            return self._ipc.stop_call(CLIENT, address, grant.grant, given.params)
+        except ApiError as error:
+            return Refusal(HTTPStatus.FORBIDDEN, error)
+
+    def _find_stop(self, loop: asyncio.AbstractEventLoop, address: str, unread: bytes) -> str | None:
+        """Return who stops the machine with the UNREAD bytes of a connection from ADDRESS; in any thread."""
+        request = parse_request(unread, loop)
+        if request is None:
+            return None
+        judged = self._judge_stop(*request, address)
+        return judged.who if isinstance(judged, StopCall) else None
+
     def _refuse(self, sentence: str) -> web.Response:
         self._refused += 1
         return web.Response(status=403, text=sentence + "\n", headers=HEADERS)
@@ -245,7 +318,7 @@ class WebServer:
         )
         if not socket.can_prepare(request).ok:
             return web.Response(status=426, headers={**HEADERS, "Upgrade": "websocket"})
-        session = self._session_of(request)
+        session = self._session_of(request.headers)
         if session is None:
             self._refused += 1
             return web.Response(status=401, text="sign in first\n", headers=HEADERS)
@@ -260,17 +333,12 @@ class WebServer:
         self, socket: web.WebSocketResponse, request: web.BaseRequest, session: PageSession
     ) -> None:
         """Carry messages both ways until one side ends."""
-
-        def check_key(key: str) -> ExternalGrant | None:
-            grant = self._grant(session)
-            if grant is None or session not in self._access.sessions or not is_key_of(session, key):
-                return None
-            return ExternalGrant(grant, session.token)
-
         transport = WebSocketTransport(socket)
-        connection = self._ipc.adopt(transport, _address(request), check_key)
+        connection = self._ipc.adopt(
+            transport, _address(request), functools.partial(self._check_key, session)
+        )
         transport.connection = connection
-        self._ipc.watch_stops(
+        self._ipc.stop_lane.watch_transport(
             connection, request.transport, lambda unread: connection.session.find_stop(lines_in(unread))
         )
         self._clients[connection] = session
@@ -298,13 +366,13 @@ def _address(request: web.BaseRequest) -> str:
     return str(peer[0]) if peer else "unknown"
 
 
-def _host(request: web.BaseRequest) -> str:
-    return request.headers.get("Host", "").lower()
+def _host(headers: MultiMapping[str]) -> str:
+    return headers.get("Host", "").lower()
 
 
-def _cookies(request: web.BaseRequest, name: str) -> list[str]:
+def _cookies(headers: MultiMapping[str], name: str) -> list[str]:
     """Return the values of the cookies called NAME; there may be several, of other ports and paths."""
-    parts = ";".join(request.headers.getall("Cookie", ())).split(";")
+    parts = ";".join(headers.getall("Cookie", ())).split(";")
     pairs = (part.strip().partition("=") for part in parts)
     return [value for found, _, value in pairs if found == name]
 

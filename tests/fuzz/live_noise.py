@@ -32,6 +32,10 @@ REQUESTS: Final = (
         b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
     ),
     b'POST /login HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 20\r\n\r\n{"token":"abcdefgh"}',
+    (
+        b"POST /emergency-stop HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://127.0.0.1\r\n"
+        b'Cookie: canductor-8080=x\r\nContent-Length: 19\r\n\r\n{"key":"abcdefghi"}'
+    ),
     b"PUT /../../etc/passwd HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\nffffffff\r\n",
 )
 CLIENT_HELLO: Final = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"

@@ -31,9 +31,11 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 import aiohttp
+from yarl import URL
 
 from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.web.stop_request import STOP_PATH
 from tests.fuzz.ipc_target import line
 from tests.fuzz.live import ROOT
 from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
@@ -268,6 +270,25 @@ class Browser:
         yield lambda: self._runner.run(shown.send_str(json.dumps(stop_of(who))))
         self._runner.run(shown.close())
 
+    @contextlib.contextmanager
+    def requesting(self, number: int, who: str) -> Iterator[Send]:
+        """The page with that NUMBER, without a connection: its stop is a request, on a new one."""
+        page, key = self._pages[number][0], self._keys[number]
+        scheme, _, host = page.partition("://")
+        cookies = self._http[number].cookie_jar.filter_cookies(URL(page)).values()
+        body = json.dumps({"key": key, "who": who}).encode()
+        head = (
+            f"POST {STOP_PATH} HTTP/1.1\r\nHost: {host}\r\nOrigin: {page}\r\nContent-Length: {len(body)}\r\n"
+            f"Cookie: {'; '.join(f'{cookie.key}={cookie.value}' for cookie in cookies)}\r\n\r\n"
+        )
+        address, _, port = host.partition(":")
+        with contextlib.ExitStack() as stack:
+            opened = stack.enter_context(socket.socket())
+            opened.bind((OWN_ADDRESS, 0))
+            if scheme == "https":
+                opened = stack.enter_context(untrusting().wrap_socket(opened, do_handshake_on_connect=True))
+            yield lambda: come(opened, (address, int(port)), head.encode() + body)
+
 
 @contextlib.contextmanager
 def klippy(machine: Machine, method: str, params: Mapping[str, str]) -> Iterator[Send]:
@@ -304,6 +325,8 @@ WAYS: Final[Mapping[str, tuple[str, Way]]] = {
     "TLS, open": (WHO, lambda machine, who: tls(machine, who, is_new=False)),
     "page": (WHO, lambda machine, who: machine.browser.stopping(0, who)),
     "page with TLS": (WHO, lambda machine, who: machine.browser.stopping(1, who)),
+    "page, a request": (WHO, lambda machine, who: machine.browser.requesting(0, who)),
+    "page with TLS, a request": (WHO, lambda machine, who: machine.browser.requesting(1, who)),
     "Klippy API, emergency_stop": (
         "by a client of the Klippy API",
         lambda machine, _: klippy(machine, "emergency_stop", {}),

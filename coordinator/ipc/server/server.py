@@ -4,15 +4,15 @@ import asyncio
 import functools
 import socket
 import ssl
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from coordinator.ipc.protocol.limits import EndReason, Limits
 from coordinator.ipc.protocol.messages import Encoder, Encoding
-from coordinator.ipc.protocol.methods import ApiError, Registry
+from coordinator.ipc.protocol.methods import ApiError, Caller, Method, Registry
 from coordinator.ipc.server.auth import Grant, LoginThrottle, Tokens, digest_of, stamp_of
 from coordinator.ipc.server.connection import Connection
 from coordinator.ipc.server.fair_scheduler import FairScheduler
@@ -21,15 +21,15 @@ from coordinator.ipc.server.session import Session, SessionContext, SessionCount
 from coordinator.ipc.server.session_methods import add_session_methods
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
-from coordinator.ipc.server.stop_lane import FindStop, StopLane
+from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, TcpListener
-from coordinator.ipc.server.tls_transport import TlsTransport
 from coordinator.ipc.server.unix_socket import UnixListener, may_use, peer_of
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 TOKENS_CHECK_S: Final = 1.0
 """Between looks at whether the tokens' file has changed."""
+STOP_METHOD: Final = "machine.emergency_stop"
 REFUSALS_MAX: Final = 32
 """Connections beyond the most that still get the reason; further ones are just closed."""
 
@@ -41,6 +41,26 @@ class ExternalGrant:
     grant: Grant
     token: bytes | None
     """Digest of the token behind it: when that is revoked the client is disconnected. None: there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class StopCall:
+    """A client's emergency stop that came outside of any session."""
+
+    method: Method
+    caller: Caller
+    params: dict[str, Any]
+
+    @property
+    def who(self) -> str | None:
+        """Who stops the machine; in any thread."""
+        return self.method.stops(self.caller, self.params)
+
+    def carry_out(self) -> Value:
+        """Stop it, and return the method's result; on the loop."""
+        result = self.method.call(self.caller, self.params)
+        assert not isinstance(result, Awaitable), "urgent methods are plain functions"
+        return result
 
 
 def _ignore(_: str) -> None:
@@ -75,7 +95,7 @@ class IpcServer:
         self._digests: dict[Connection, bytes] = {}  # digests of the tokens that clients came in with
         self._tcp: set[Connection] = set()
         """Connections that count against ``tcp_connections_max``."""
-        self._stop_lane = stop_lane or StopLane()
+        self.stop_lane = stop_lane or StopLane()
         self._watch: asyncio.Task[None] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._scheduler: FairScheduler | None = None
@@ -155,7 +175,7 @@ class IpcServer:
 
     async def _open_unix(self, path: Path, scheduler: FairScheduler) -> None:
         self._unix = UnixListener(
-            lambda: Connection(self._admit_unix, self._drop, scheduler), self._stop_lane, self._find_stop
+            lambda: Connection(self._admit_unix, self._drop, scheduler), self.stop_lane, self._find_stop
         )
         await self._unix.open(path)
 
@@ -168,7 +188,7 @@ class IpcServer:
             context,
             handshakes_max=min(HANDSHAKES_MAX, most),
             may_enter=lambda entering: entering + len(self._tcp) < most + REFUSALS_MAX,
-            stop_lane=self._stop_lane,
+            stop_lane=self.stop_lane,
             find_stop=self._find_stop_over_tcp,
         )
         try:
@@ -179,18 +199,6 @@ class IpcServer:
             ) from None
         self.tcp_port = listener.addresses[0][1]
         self.tcp_addresses = [address for address, _ in listener.addresses]
-
-    def watch_stops(
-        self, connection: Connection, transport: asyncio.BaseTransport | None, find_stop: FindStop
-    ) -> None:
-        """Look for stops of CONNECTION in what TRANSPORT has unread, while the loop is held."""
-        opened = None if transport is None else transport.get_extra_info("socket")
-        if opened is None:
-            return
-        if isinstance(transport, TlsTransport):
-            self._stop_lane.watch_with(connection, opened, functools.partial(transport.find_in, find_stop))
-        else:
-            self._stop_lane.watch(connection, opened, find_stop)
 
     # ----------------------------------------------------------------------------------------- tokens
 
@@ -250,6 +258,19 @@ class IpcServer:
         connection = Connection(admit, self._drop, self._scheduler)
         connection.connection_made(transport)
         return connection
+
+    def stop_call(self, client: str, address: str, grant: Grant, params: Mapping[str, Any]) -> StopCall:
+        """Return the emergency stop of CLIENT at ADDRESS, which has GRANT; in any thread.
+
+        Raises ApiError ``not_allowed``. What is wrong in PARAMS is ignored.
+        """
+        method = self._context.registry.methods[STOP_METHOD]
+        if method.scope > grant.scope:
+            needed, has = method.scope.word, grant.scope.word
+            raise ApiError("not_allowed", f"{STOP_METHOD} needs the scope {needed}, this client has {has}")
+        peer = f"{address}, token {grant.name}" if grant.name else address
+        usable, _ = method.check_urgent(dict(params))
+        return StopCall(method, Caller(f"{client} ({peer})", grant.scope), usable)
 
     def check_token(self, token: str, address: str) -> Grant:
         """Return what TOKEN gives to somebody at ADDRESS; counts failures.
@@ -358,7 +379,7 @@ class IpcServer:
             find_token=find_token,
         )
         self._connections.add(connection)
-        self.watch_stops(connection, connection.transport, session.find_stop)
+        self.stop_lane.watch_transport(connection, connection.transport, session.find_stop)
         if len(self._connections) > self._settings.connections_max:
             self._refuse(session, EndReason("busy", "there are too many connections; close others"))
         if len(self._connections) > self._settings.connections_max + REFUSALS_MAX:
@@ -373,7 +394,7 @@ class IpcServer:
         self._connections.discard(connection)
         self._tcp.discard(connection)
         self._digests.pop(connection, None)
-        self._stop_lane.forget(connection)
+        self.stop_lane.forget(connection)
         for field in fields(SessionCounters):
             total = getattr(self._closed_totals, field.name) + getattr(
                 connection.session.counters, field.name

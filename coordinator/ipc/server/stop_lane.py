@@ -6,6 +6,7 @@ can, and answers them: that changes nothing any more. Connections are accepted m
 because ``canductor estop`` comes with a new one.
 """
 
+import asyncio
 import contextlib
 import functools
 import os
@@ -14,6 +15,8 @@ import threading
 from asyncio.trsock import TransportSocket
 from collections.abc import Callable, Hashable
 from typing import Final
+
+from coordinator.ipc.server.tls_transport import TlsTransport
 
 FindStop = Callable[[bytes], str | None]
 """Returns who stops the machine with bytes that are unread; None: nobody does. In any thread."""
@@ -46,6 +49,18 @@ class StopLane:
             own = socket.socket(fileno=os.dup(opened.fileno()))
             self._peeking[key] = own
             self.watch_with(key, opened, functools.partial(find_unread, own, find_stop))
+
+    def watch_transport(
+        self, key: Hashable, transport: asyncio.BaseTransport | None, find_stop: FindStop
+    ) -> None:
+        """Look at what TRANSPORT has unread, with TLS or without, until ``forget`` of KEY."""
+        opened = None if transport is None else transport.get_extra_info("socket")
+        if opened is None:
+            return
+        if isinstance(transport, TlsTransport):
+            self.watch_with(key, opened, functools.partial(transport.find_in, find_stop))
+        else:
+            self.watch(key, opened, find_stop)
 
     def watch_with(self, key: Hashable, opened: socket.socket | TransportSocket, find: Finder) -> None:
         """Ask FIND about OPENED, until ``forget`` of KEY; it is not new any more."""

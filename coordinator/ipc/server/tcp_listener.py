@@ -69,8 +69,10 @@ class TcpListener:
         server = await loop.create_server(asyncio.Protocol, host, port, start_serving=False)
         try:
             for bound in server.sockets:  # asyncio has resolved the addresses
+                self.addresses.append(
+                    bound.getsockname()[:2]
+                )  # first: connections come in another thread, too
                 self._acceptors.append(Acceptor(bound.dup(), self._stop_lane, self._arrive))
-                self.addresses.append(bound.getsockname()[:2])
         except OSError:
             self.close()
             raise

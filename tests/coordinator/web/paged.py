@@ -13,6 +13,7 @@ import aiohttp
 from coordinator.ipc.protocol.methods import Scope
 from coordinator.web.server import WebServer
 from coordinator.web.settings import WebSettings
+from coordinator.web.stop_request import STOP_PATH
 from tests.coordinator.ipc.served import Served, serving
 
 LIMIT_S = 20.0
@@ -58,6 +59,29 @@ class Paged:
     async def hello(self, socket: aiohttp.ClientWebSocketResponse) -> Any:
         """Say hello as the page's script does, and return the answer."""
         return await ask(socket, "api.hello", version=1, client="the page", token=self.key)
+
+    @property
+    def cookie(self) -> str:
+        """The session's cookie, as a browser sends it."""
+        return "; ".join(f"{cookie.key}={cookie.value}" for cookie in self.http.cookie_jar)
+
+    def stop_request(self, body: bytes | None = None, **headers: str) -> bytes:
+        """Return the emergency stop as the page's script sends it as a request; HEADERS change its own."""
+        if body is None:
+            body = json.dumps({"key": self.key, "who": "me"}).encode()
+        own = {"Host": self.at.partition("//")[2], "Origin": self.at, "Cookie": self.cookie}
+        changed = {name.replace("_", "-"): value for name, value in headers.items()}
+        sent = own | {"Content-Length": str(len(body))} | changed
+        lines = [f"{name}: {value}\r\n" for name, value in sent.items() if value]
+        return f"POST {STOP_PATH} HTTP/1.1\r\n{''.join(lines)}\r\n".encode() + body
+
+    async def stop(self, body: Any = None, **headers: str) -> tuple[int, Any]:
+        """Stop the machine by a request; return the status and the answer."""
+        given = {"key": self.key, "who": "me"} if body is None else body
+        data = given if isinstance(given, bytes) else json.dumps(given).encode()
+        posted = self.http.post(f"{self.at}{STOP_PATH}", data=data, headers={"Origin": self.at, **headers})
+        async with posted as answer:
+            return answer.status, json.loads(await answer.read() or b"null")
 
     async def session_status(self) -> int:
         """Ask whether this browser is signed in."""

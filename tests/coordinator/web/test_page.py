@@ -6,8 +6,9 @@ notes; one test takes a machine of virtual nodes through a print.
 
 import asyncio
 import re
+import threading
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from typing import Final
 from urllib.parse import urlsplit
@@ -25,6 +26,7 @@ NOT_SIGNED_IN: Final = "status of 401"
 FORBIDDEN: Final = "status of 403"
 WEBSOCKET_REFUSED: Final = "WebSocket connection to "
 UNREACHED: Final = "ERR_CONNECTION"
+NOT_SENT: Final = "ERR_FAILED"
 NO_METHOD: Final = "there is no method"
 
 KEEP_SOCKETS: Final = """
@@ -65,6 +67,17 @@ def cut_all(paged: Paged) -> None:
     """End all connections of the page."""
     for connection in list(paged.page._clients):
         connection.transport.close()
+
+
+@contextmanager
+def held(paged: Paged) -> Iterator[None]:
+    """Hold the server's loop inside."""
+    over = threading.Event()
+    paged.loop.call_soon_threadsafe(over.wait)
+    try:
+        yield
+    finally:
+        over.set()
 
 
 def link(paged: Paged, scope: Scope = Scope.OPERATE) -> str:
@@ -178,8 +191,51 @@ def test_the_stop_has_a_way_of_its_own(browser: Browser, paged: Paged) -> None:
     assert tab.text("state") in ("connecting", "no connection")
     tab.page.keyboard.press("Control+Shift+.")
     tab.page.get_by_text("All nodes were told to stop").wait_for()
-    assert paged.served.stops == ["the live page (127.0.0.1)"]
+    assert set(paged.served.stops) == {"the live page (127.0.0.1)"}
     tab.close(NO_METHOD)
+
+
+def test_the_stop_needs_no_connection(browser: Browser, paged: Paged) -> None:
+    """No WebSocket opens; then the program's loop is held as well, and the stop lane finds the request."""
+    paged.served.stops.clear()
+    tab = Visitor(browser)
+    tab.page.route_web_socket(re.compile("/socket$"), lambda socket: socket.close())
+    tab.page.goto(link(paged))
+    stop = tab.page.get_by_role("button", name="Emergency stop")
+    tab.until("localStorage.getItem('canductor.key') !== null")
+    stop.click()
+    tab.page.get_by_text("All nodes were told to stop").wait_for()
+    assert set(paged.served.stops) == {"the live page (127.0.0.1)"}
+
+    lane, found = paged.served.server.stop_lane, list[str]()
+    lane._stop = found.append
+    with held(paged):
+        paged.served.stops.clear()
+        stop.click()
+
+        def look() -> bool:
+            lane.look()
+            return bool(found)
+
+        tab.wait_for(look, "the stop")
+        assert found[0] == "the live page (127.0.0.1)"
+        assert paged.served.stops == []
+        tab.page.get_by_text("NOT confirmed yet").wait_for()
+    tab.page.get_by_text("All nodes were told to stop").wait_for()
+    tab.close(NO_METHOD)
+
+
+def test_a_stop_that_is_refused_says_so(browser: Browser, paged: Paged) -> None:
+    """By a browser that may only watch, and does not know it yet."""
+    paged.served.stops.clear()
+    tab = Visitor(browser)
+    tab.page.route_web_socket(re.compile("/socket$"), lambda socket: socket.close())
+    tab.page.goto(link(paged, Scope.WATCH))
+    tab.until("localStorage.getItem('canductor.key') !== null")
+    tab.page.get_by_role("button", name="Emergency stop").click()
+    tab.page.get_by_text("NOT stopped: machine.emergency_stop needs the scope operate").wait_for()
+    assert paged.served.stops == []
+    tab.close(NO_METHOD, FORBIDDEN)
 
 
 def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, paged: Paged) -> None:
@@ -202,6 +258,7 @@ def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, 
             socket.close()
 
     tab.page.route_web_socket(re.compile("/socket$"), route)
+    tab.page.route("**/emergency-stop", lambda asked: asked.continue_() if way_is_open else asked.abort())
     tab.page.clock.install()
     tab.page.goto(link(paged))
     stop = tab.page.get_by_role("button", name="Emergency stop")
@@ -222,7 +279,7 @@ def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, 
     way_is_open = True
     tab.page.get_by_text("All nodes were told to stop").wait_for()
     assert set(paged.served.stops) == {"the live page (127.0.0.1)"}
-    tab.close(NO_METHOD)
+    tab.close(NO_METHOD, NOT_SENT)
 
 
 # --------------------------------------------------------------------------------------------------- a print

@@ -5,19 +5,23 @@ import json
 import socket
 import ssl
 import time
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.protocol.methods import Scope
 from coordinator.ipc.server.settings import TcpSettings
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.web.settings import WebSettings
-from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, run
+from coordinator.web.stop_request import STOP_PATH, parse_request
+from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, run, tokens_file
 from tests.coordinator.web.paged import LOOPBACK, Paged, paging
 from tests.stages import jump_loop
 
@@ -222,6 +226,20 @@ class Dialled:
         self._tls.write(data)
         self._socket.sendall(self._outgoing.read())
 
+    def receive(self) -> bytes:
+        """Return what has come."""
+        with suppress(BlockingIOError):
+            data = self._socket.recv(65_536)
+            if self._tls is None:
+                return data
+            self._incoming.write(data)
+        found = b""
+        if self._tls is not None:
+            with suppress(ssl.SSLWantReadError):
+                while data := self._tls.read(65_536):
+                    found += data
+        return found
+
     def close(self) -> None:
         self._socket.close()
 
@@ -373,3 +391,268 @@ def test_a_connection_with_tls_that_exists(tmp_path: Path, certificate: tuple[Pa
         await served.server_has(0)
 
     run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, certificate))
+
+
+# ------------------------------------------------------------------------ the page's stop as a request
+
+
+def run_page(
+    folder: Path,
+    certificate: tuple[Path, Path] | None,
+    lane: Lane,
+    go: Callable[[Paged], Coroutine[Any, Any, None]],
+    **settings: Any,
+) -> None:
+    """Serve the page, with TLS if there is a CERTIFICATE, and let GO test it."""
+    page = LOOPBACK
+    if certificate is not None:
+        page = WebSettings(host="127.0.0.1", port=0, certificate=certificate[0], private_key=certificate[1])
+
+    async def main() -> None:
+        async with paging(folder, page, stop_lane=lane, **settings) as paged:
+            await go(paged)
+
+    jump_loop.run(main())
+
+
+def request_stop(paged: Paged, lane: Lane, chosen: tuple[Path, Path] | None, data: bytes) -> Dialled:
+    """Send DATA over a new connection while the loop has no turn."""
+    dialled = Dialled(paged.page.port, chosen)
+    while not dialled.shake_hands():
+        assert lane.seen() == []
+    dialled.send(data)
+    return dialled
+
+
+@TLS
+def test_a_page_without_a_connection_stops_the_machine(
+    tmp_path: Path, certificate: tuple[Path, Path], *, secret: bool
+) -> None:
+    """Failed before: a page that comes back waited for the loop."""
+    lane, chosen = Lane(), certificate if secret else None
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in(Scope.WATCH)
+        request_stop(paged, lane, chosen, paged.stop_request()).close()
+        await paged.sign_in(Scope.OPERATE)
+        data = paged.stop_request()
+        cut = len(data) - 1
+        dialled = request_stop(paged, lane, chosen, data[:cut])
+        for _ in range(3):
+            assert lane.seen() == []
+        dialled.send(data[cut:])
+        assert lane.sees(["me"])
+        assert paged.served.stops == [], "the loop has not read it"
+        while not paged.served.stops:  # noqa: ASYNC110 (there is no event for it)
+            await asyncio.sleep(0)
+        answer = b""
+        while b'"state"' not in answer:
+            await asyncio.sleep(0)
+            answer += dialled.receive()
+        assert answer.startswith(b"HTTP/1.1 200 ")
+        lane.stops.clear()
+        for _ in range(3):
+            assert lane.seen() == [], "what was answered stops nothing any more"
+        dialled.send(data)
+        assert lane.sees(["me"]), "the connection is kept alive"
+        dialled.close()
+
+    run_page(tmp_path, chosen, lane, go)
+
+
+@TLS
+@pytest.mark.parametrize("cut", [1, 60, -30])
+def test_a_page_on_a_connection_that_has_served_it(
+    tmp_path: Path, certificate: tuple[Path, Path], cut: int, *, secret: bool
+) -> None:
+    """Its files came by it; the first bytes of the stop were read before the hold."""
+    lane, chosen = Lane(), certificate if secret else None
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in()
+        dialled = Dialled(paged.page.port, chosen)
+        while not dialled.shake_hands():  # noqa: ASYNC110 (there is no event for it)
+            await asyncio.sleep(0)
+        for _ in range(2):
+            dialled.send(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{paged.page.port}\r\n\r\n".encode())
+            received = b""
+            while b"</html>" not in received:
+                await asyncio.sleep(0)
+                received += dialled.receive()
+        data = paged.stop_request()
+        dialled.send(data[:cut])
+        await asyncio.sleep(0.1)
+        assert lane.seen() == []
+        dialled.send(data[cut:])
+        assert lane.sees(["me"])
+        while not paged.served.stops:  # noqa: ASYNC110 (there is no event for it)
+            await asyncio.sleep(0)
+        assert paged.served.stops == ["me"]
+        dialled.close()
+
+    run_page(tmp_path, chosen, lane, go)
+
+
+@ROUNDS
+@TLS
+def test_a_request_of_the_page_that_the_loop_has_begun_to_take(
+    tmp_path: Path, certificate: tuple[Path, Path], rounds: int, *, secret: bool
+) -> None:
+    """The hold begins in any round between its first byte and its answer."""
+    lane, chosen = Lane(), certificate if secret else None
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in()
+        dialled = Dialled(paged.page.port, chosen)
+        while not dialled.shake_hands():  # noqa: ASYNC110 (there is no event for it)
+            await asyncio.sleep(0)
+        dialled.send(paged.stop_request())
+        for _ in range(rounds):
+            await asyncio.sleep(0)
+        if not paged.served.stops:
+            assert lane.sees(["me"])
+        while not paged.served.stops:  # noqa: ASYNC110 (there is no event for it)
+            await asyncio.sleep(0)
+        lane.stops.clear()
+        assert lane.seen() == []
+        dialled.close()
+
+    run_page(tmp_path, chosen, lane, go)
+
+
+WRONG: list[dict[str, Any]] = [
+    {"Host": "evil.example"},
+    {"Host": "evil.example", "Origin": "http://evil.example"},
+    {"Host": ""},
+    {"Origin": "http://evil.example"},
+    {"Origin": "null"},
+    {"Origin": ""},
+    {"Cookie": ""},
+    {"Cookie": "canductor-1=x"},
+    {"Content_Length": ""},
+    {"Content_Length": "x"},
+    {"Content_Length": "-1"},
+    {"Content_Length": "", "Transfer_Encoding": "chunked"},
+    {"Content_Length": "", "Transfer_Encoding": "chunked", "body": b"1\r\nx\r\n" * 2600},
+    {"Transfer_Encoding": "chunked"},
+    {"Content_Length": "9" * 5000},
+    {"Content_Length": "\u0661"},
+    {"X Y": "1"},
+    {"X": "1\r\nHost: 127.0.0.1"},
+    {"X": "y" * 20_000},
+    {"body": b""},
+    {"body": b"[]"},
+    {"body": b"{}"},
+    {"body": b'{"key": 1}'},
+    {"body": b'{"key": "x"}'},
+    {"body": b"\xff"},
+    {"body": b"[" * 1000},
+    {"body": b"[" * 20_000},
+]
+
+
+def test_requests_of_others_stop_nothing(tmp_path: Path) -> None:
+    """Whether the loop has met the connection or not; nothing is raised. It refuses them likewise."""
+    lane = Lane()
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in(Scope.WATCH)
+        data = [paged.stop_request()]
+        async with paged.other() as other:
+            await other.sign_in(Scope.OPERATE)
+            data += [other.stop_request(**wrong) for wrong in WRONG]
+            mixed = replace(other, key=paged.key)
+            data += [mixed.stop_request(), b"POST /other HTTP/1.1" + other.stop_request()[29:]]
+            data += [other.stop_request().replace(b"POST", b"GET"), b"X" + other.stop_request()]
+            opened = [Dialled(paged.page.port, None) for _ in data]
+            for dialled, sent in zip(opened, data, strict=True):
+                dialled.send(sent)
+            assert lane.seen() == []
+            await asyncio.sleep(1)
+            assert lane.seen() == []
+            assert paged.served.stops == []
+            for dialled in opened:
+                dialled.close()
+            request_stop(paged, lane, None, other.stop_request()).close()
+            assert lane.seen() == ["me"], "of all those it was the right one"
+
+    run_page(tmp_path, None, lane, go)
+
+
+INSERTED: Final = (
+    b"\r\n",
+    b"Transfer-Encoding: chunked\r\n",
+    b"Content-Length: 3\r\n",
+    b"Content-Encoding: gzip\r\n",
+    b"Connection: upgrade\r\nUpgrade: websocket\r\n",
+    b"1\r\nx\r\n" * 300,
+    b" continued\r\n",
+)
+
+
+@given(st.data())
+def test_what_is_no_request_is_none(data: st.DataObject) -> None:
+    """A stop that is cut, changed or followed by anything is read as one, or not; nothing is raised."""
+    body = b'{"key": "x"}'
+    head = f"POST {STOP_PATH} HTTP/1.1\r\nHost: a\r\nContent-Length: {len(body)}\r\n\r\n".encode()
+    sent = bytearray(head + body)
+    for at in data.draw(st.lists(st.integers(30, len(sent)), max_size=2)):
+        sent[at:at] = data.draw(st.sampled_from(INSERTED))
+    for _ in range(data.draw(st.integers(0, 3))):
+        sent[data.draw(st.integers(0, len(sent) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.integers(0, len(sent)))
+    loop = asyncio.new_event_loop()
+    loop.close()  # nobody may use it
+    found = parse_request(bytes(sent[:cut]), loop)
+    assert found is None or found[0]["Content-Length"]
+    parse_request(bytes(sent) + data.draw(st.binary()), loop)
+    assert (parse_request((head + body)[:cut], loop) is not None) == (cut >= len(head + body))
+
+
+def test_a_token_that_was_taken_away_stops_nothing(tmp_path: Path) -> None:
+    lane = Lane()
+
+    async def go(paged: Paged) -> None:
+        await paged.log_in(TOKENS[Scope.OPERATE])
+        request_stop(paged, lane, None, paged.stop_request()).close()
+        assert lane.seen() == ["me"]
+        await asyncio.sleep(0.1)
+        lane.stops.clear()
+        paged.served.server._tokens = None
+        request_stop(paged, lane, None, paged.stop_request()).close()
+        assert lane.seen() == []
+
+    run_page(tmp_path, None, lane, go, tokens=tokens_file(tmp_path))
+
+
+def test_a_session_under_a_foreign_name_stops_nothing(tmp_path: Path) -> None:
+    """Nobody can sign in there; if somebody could, it would not help."""
+    lane = Lane()
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in()
+        (session,) = paged.page._access.sessions
+        session.host = "evil.example"
+        data = paged.stop_request(Host="evil.example", Origin="http://evil.example")
+        request_stop(paged, lane, None, data).close()
+        assert lane.seen() == []
+
+    run_page(tmp_path, None, lane, go)
+
+
+def test_a_page_that_has_left_is_forgotten(tmp_path: Path) -> None:
+    lane = Lane()
+
+    async def go(paged: Paged) -> None:
+        before = len(lane._unread)
+        await paged.sign_in()
+        assert len(lane._unread) == before + 1
+        async with paged.socket() as page:
+            await paged.hello(page)
+            assert len(lane._unread) == before + 1, "as a WebSocket it is looked at as one"
+        await paged.http.close()
+        await asyncio.sleep(1)
+        assert len(lane._unread) == before
+        assert not lane._new
+
+    run_page(tmp_path, None, lane, go)
