@@ -1,6 +1,7 @@
 """Random bytes on the ways into a service that live_visits.py does not know.
 
-Usage: python -m tests.fuzz.live_noise FOLDER PAGE TLS METRICS FD SEED; ends with its standard input. PAGE,
+Usage: python -m tests.fuzz.live_noise FOLDER PAGE TLS METRICS FD SEED; ends with its standard input, and is
+quiet from a line ``rest`` there to a line ``go``. PAGE,
 TLS and METRICS are ports, PAGE several with commas between; FD is the file descriptor of the terminal.
 What is sent is bytes, requests of HTTP and parts of them, beginnings of TLS, lines of nonsense, and uploads
 that are broken off. Prints one JSON line: how many bursts came on each way.
@@ -106,11 +107,16 @@ def main() -> None:
         "uploads": lambda: visit(str(folder / "api.sock"), uploads()),
     }
     os.set_blocking(terminal_fd, False)
-    while not select.select([sys.stdin], [], [], PAUSE_S)[0]:
+    while True:
+        order = b"go"
+        while order == b"rest" or select.select([sys.stdin], [], [], PAUSE_S)[0]:
+            order = b"".join(os.read(sys.stdin.fileno(), 4096).split()[-1:])  # what was said last counts
+            if not order:
+                sys.stdout.write(json.dumps(counts) + "\n")
+                return
         way = chance.choice(list(ways))
         ways[way]()
         counts[way] += 1
-    sys.stdout.write(json.dumps(counts) + "\n")
 
 
 if __name__ == "__main__":

@@ -2,13 +2,17 @@
 
 Usage, from the project's root: python -m tests.fuzz.live_stops [--minutes M] [--seed N]
 
-A service on virtual nodes prints, in a process of its own (stopped_service.py). All the time clients that are
-random, wrong, slow or rude come and go on the Unix socket and TCP (live_visits.py), and random bytes come on
-all other ways in (live_noise.py). As fast as the machine restarts and moves again, an emergency stop is sent
-by the next way in, by turns while the control loop is free, while it is held by what waits, and while it is
-held by what calculates; a plain restart follows. Each time is from before the stop's last bytes are sent to
-the edge of the node's pin. It ends with status 1 when a stop has no effect, comes later than its bound or
-does not name who stopped, or when a restart fails. Run it on a computer that does nothing else.
+Services on virtual nodes print, each in a process of its own (stopped_service.py). Clients that are random,
+wrong, slow or rude come and go on the Unix socket and TCP (live_visits.py), and random bytes come on all
+other ways in (live_noise.py), always at the machine that is stopped next. They stand for other computers:
+they take only the processor time that is left. An emergency stop is sent by the next way in, by turns while
+the control loop is free, while it is held by what waits, and while it is held by what calculates. A plain
+restart follows, and meanwhile the next machine is stopped: with five machines, there is a stop about every
+second. With --machines 1 the fuzzers are there during restarts, too.
+
+Each time is from before the stop's last bytes are sent to the edge of the node's pin. It ends with status 1
+when a stop has no effect, comes later than its bound or does not name who stopped, or when a restart fails.
+Run it on a computer that does nothing else.
 """
 
 import argparse
@@ -45,6 +49,7 @@ BOUNDS_MS: Final = {"free": 10.0, "held": 50.0, "calculating": 50.0}
 """Of the time to the node's pin, by the state of the loop."""
 OWN_ADDRESS: Final = "127.0.0.9"
 """From here stops come over TCP: wrong tokens lock the fuzzers' addresses out."""
+LEAST_PRIORITY: Final = ("nice", "-n", "19")
 PATIENCE_S: Final = 60.0
 LOOK_S: Final = 0.005
 PROGRAM: Final = "SET_KINEMATIC_POSITION X=100 Y=100 Z=10\n" + "G1 X20 F3000\nG1 X180\n" * 500
@@ -59,6 +64,10 @@ class Stop:
     """Its state, as in ``BOUNDS_MS``."""
     sent_ns: int
     """CLOCK_MONOTONIC."""
+    machine: Path = Path()
+    """Its folder."""
+    waited_ms: float = 0.0
+    """How long the loop's thread was ready and waited for a processor meanwhile."""
 
 
 @dataclass
@@ -82,6 +91,7 @@ class Machine:
         self.browser: Browser
         self.operator: BlockingClient
         self._process: subprocess.Popen[str]
+        self._prints = False
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
@@ -135,12 +145,21 @@ class Machine:
                 raise TimeoutError(f"no end of waiting until {what}; the machine: {self.state}")
             time.sleep(LOOK_S)
 
+    @property
+    def waited_ms(self) -> float:
+        """How long the thread of its loop has waited for a processor so far."""
+        number = self._process.pid
+        return int(Path(f"/proc/{number}/task/{number}/schedstat").read_text().split()[1]) * 1e-6
+
     def begin(self) -> None:
-        """Wait until it is ready, switch the fan on, and print; lines that were typed are done first."""
+        """Have it print with the fan on, unless it does already; lines that were typed are done first."""
+        if self._prints:
+            return
         self.wait_for(lambda: self.state["state"] == "ready", "it is ready")
         for method, params in (("gcode.run", {"script": "M106 S255"}), ("job.start", {"file": "long.gcode"})):
             self.wait_for(lambda: self._is_done(method, params), f"{method} is done")  # noqa: B023 (at once)
         self.wait_for(lambda: fan_turns(self.folder), "the fan turns")
+        self._prints = True
 
     def _is_done(self, method: str, params: Mapping[str, str]) -> bool:
         try:
@@ -153,6 +172,7 @@ class Machine:
 
     def restart(self) -> None:
         """Start it again, plainly, after a stop."""
+        self._prints = False
         self.operator.call("machine.restart")
 
 
@@ -351,50 +371,82 @@ def with_terminal(command: Sequence[str], terminal: int) -> subprocess.Popen[str
     )
 
 
-@contextlib.contextmanager
-def visitors(machine: Machine, seed: int, found: Found) -> Iterator[None]:
-    """Have clients of live_visits.py come and go, and noise on all other ways."""
-    ports = [page.split("/#")[0].rpartition(":")[2] for page in machine.ways["pages"]]
-    visits = [str(machine.folder / "open.sock"), str(machine.ways["tcp"]), WATCH_TOKEN]
-    noise = [str(machine.folder), ",".join(ports), str(machine.ways["tls"]), str(machine.ways["metrics"])]
-    noise.append(str(machine.terminal))
-    with contextlib.ExitStack() as stack:
-        running = {
-            name: stack.enter_context(
-                with_terminal(
-                    [sys.executable, "-m", f"tests.fuzz.{name}", *given, str(seed)], machine.terminal
-                )
+class Fuzzers:
+    """Clients of live_visits.py that come and go at MACHINE, and noise on all other ways.
+
+    They rest until they are told to go. A context manager; what they saw goes to FOUND at its end.
+    """
+
+    def __init__(self, machine: Machine, seed: int, found: Found) -> None:
+        ports = [page.split("/#")[0].rpartition(":")[2] for page in machine.ways["pages"]]
+        visits = [str(machine.folder / "open.sock"), str(machine.ways["tcp"]), WATCH_TOKEN]
+        noise = [str(machine.folder), ",".join(ports), str(machine.ways["tls"])]
+        noise += [str(machine.ways["metrics"]), str(machine.terminal)]
+        self._found = found
+        self._running = [
+            with_terminal(
+                [*LEAST_PRIORITY, sys.executable, "-m", f"tests.fuzz.{name}", *given, str(seed)],
+                machine.terminal,
             )
             for name, given in (("live_visits", visits), ("live_noise", noise))
-        }
-        try:
-            yield
-        finally:
-            visited = json.loads(running["live_visits"].communicate()[0])
-            found.counts.update(visited["counts"])
-            found.problems += visited["problems"]
-            made = json.loads(running["live_noise"].communicate()[0])
-            found.counts.update({f"noise: {way}": count for way, count in made.items()})
+        ]
+        self.rest()
+
+    def rest(self) -> None:
+        """Let nobody come any more."""
+        self._tell("rest")
+
+    def go(self) -> None:
+        """Let them come."""
+        self._tell("go")
+
+    def _tell(self, order: str) -> None:
+        for process in self._running:
+            assert process.stdin is not None
+            process.stdin.write(order + "\n")
+            process.stdin.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        visited, made = (json.loads(process.communicate()[0]) for process in self._running)
+        self._found.counts.update(visited["counts"])
+        self._found.problems += visited["problems"]
+        self._found.counts.update({f"noise: {way}": count for way, count in made.items()})
 
 
-def stop_again_and_again(machine: Machine, minutes: float, found: Found) -> None:
-    """Print, stop, restart, for MINUTES."""
-    (machine.folder / "long.gcode").write_text(PROGRAM, encoding="ascii")
+def stop_again_and_again(machines: Sequence[tuple[Machine, Fuzzers]], minutes: float, found: Found) -> None:
+    """Print, stop, restart, for MINUTES, the MACHINES in turn."""
+    for machine, _ in machines:
+        (machine.folder / "long.gcode").write_text(PROGRAM, encoding="ascii")
     ends_s, turn = time.monotonic() + 60 * minutes, 0
     while time.monotonic() < ends_s:
+        machine, fuzzers = machines[turn % len(machines)]
+        following, _ = machines[(turn + 1) % len(machines)]
         way, state = list(WAYS)[turn // len(BOUNDS_MS) % len(WAYS)], list(BOUNDS_MS)[turn % len(BOUNDS_MS)]
         turn += 1
+        fuzzers.go()
         machine.begin()
-        who, stopping = WAYS[way]
-        with stopping(machine, who.format(turn)) as send, machine.loop(state):
-            sent_ns = time.monotonic_ns()
-            send()
-            machine.wait_for(lambda: not fan_turns(machine.folder), f"the node is stopped by {way}")
-        found.stops.append(Stop(way, state, sent_ns))
-        machine.wait_for(lambda: machine.state["state"] == "shutdown", "it is shut down")
-        if who.format(turn) not in (cause := machine.state["cause"]):
-            found.problems.append(f"stop {turn} by {way}, the loop {state}: the cause is {cause!r}")
-        machine.restart()
+        following.begin()
+        stop(machine, way, state, f"{turn}", found)
+        if len(machines) > 1:
+            fuzzers.rest()
+
+
+def stop(machine: Machine, way: str, state: str, number: str, found: Found) -> None:
+    """Stop MACHINE by WAY with its loop in STATE, then restart it."""
+    who, stopping = WAYS[way]
+    waited_ms = machine.waited_ms
+    with stopping(machine, who.format(number)) as send, machine.loop(state):
+        sent_ns = time.monotonic_ns()
+        send()
+        machine.wait_for(lambda: not fan_turns(machine.folder), f"the node is stopped by {way}")
+    found.stops.append(Stop(way, state, sent_ns, machine.folder, machine.waited_ms - waited_ms))
+    machine.wait_for(lambda: machine.state["state"] == "shutdown", "it is shut down")
+    if who.format(number) not in (cause := machine.state["cause"]):
+        found.problems.append(f"stop {number} by {way}, the loop {state}: the cause is {cause!r}")
+    machine.restart()
 
 
 # ---------------------------------------------------------------------------------------------- the figures
@@ -418,11 +470,21 @@ def table(stops: Sequence[Stop], taken_ms: Sequence[float]) -> Iterator[str]:
             yield f"loop {state}: n {len(every)}, worst {max(every):.2f} ms; bound {bound_ms:g} ms"
 
 
+def taken(stops: Sequence[Stop]) -> list[float]:
+    """Return how long each of STOPS took to the node's pin, ms; the machines have ended."""
+    found: dict[Stop, float] = {}
+    for folder in {stop.machine for stop in stops}:
+        own = [stop for stop in stops if stop.machine == folder]
+        found |= zip(own, stopped_after_ms(folder, [stop.sent_ns for stop in own]), strict=True)
+    return [found[stop] for stop in stops]
+
+
 def verdict(found: Found, taken_ms: Sequence[float]) -> list[str]:
     """Return what does not hold, in sentences; TAKEN_MS are the times of the stops."""
     wrong = [f"PROBLEM: {sentence}" for sentence in found.problems]
     wrong += [
-        f"a stop by {stop.way}, the loop {stop.loop}, took {ms:.2f} ms; bound {BOUNDS_MS[stop.loop]:g} ms"
+        f"a stop by {stop.way}, the loop {stop.loop}, took {ms:.2f} ms; bound {BOUNDS_MS[stop.loop]:g} ms;"
+        f" the loop waited {stop.waited_ms:.2f} ms for a processor"
         for stop, ms in zip(found.stops, taken_ms, strict=True)
         if ms > BOUNDS_MS[stop.loop]
     ]
@@ -440,13 +502,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--machines", type=int, default=5, help="that are stopped in turn")
     given = parser.parse_args()
-    found, begun_s = Found(), time.monotonic()
-    with tempfile.TemporaryDirectory() as name:
-        with Machine(Path(name)) as machine, visitors(machine, given.seed, found):
-            stop_again_and_again(machine, given.minutes, found)
-        taken_ms = stopped_after_ms(Path(name), [stop.sent_ns for stop in found.stops])
-    each_s = (time.monotonic() - begun_s) / max(1, len(found.stops))
+    found = Found()
+    with contextlib.ExitStack() as stack:
+        folders = [stack.enter_context(tempfile.TemporaryDirectory()) for _ in range(given.machines)]
+        with contextlib.ExitStack() as running:
+            machines = [running.enter_context(Machine(Path(folder))) for folder in folders]
+            fuzzed = [
+                (machine, running.enter_context(Fuzzers(machine, given.seed + number, found)))
+                for number, machine in enumerate(machines)
+            ]
+            begun_s = time.monotonic()
+            stop_again_and_again(fuzzed, given.minutes, found)
+            each_s = (time.monotonic() - begun_s) / max(1, len(found.stops))
+        taken_ms = taken(found.stops)
     load = " ".join(f"{value:.1f}" for value in os.getloadavg())
     noise = {name: count for name, count in sorted(found.counts.items()) if name.startswith("noise")}
     rows = [

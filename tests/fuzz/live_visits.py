@@ -1,7 +1,8 @@
 """Visits of clients that are random, wrong, slow or rude to a service that runs.
 
 Usage: python -m tests.fuzz.live_visits SOCKET PORT TOKEN SEED; ends with its standard input. What they may do
-over TCP is what TOKEN gives, and over the socket what its owner's programs may.
+over TCP is what TOKEN gives, and over the socket what its owner's programs may. After a line ``rest`` on
+standard input nobody comes any more until a line ``go``.
 
 Every visit is made from a seed. What the server says must always be readable, whoever it cuts off is told
 why, and no method may fail by a mistake of the program; ``problems`` has the seeds of those where it was not.
@@ -9,6 +10,7 @@ why, and no method may fail by a mistake of the program; ``problems`` has the se
 
 import asyncio
 import json
+import os
 import random
 import socket
 import struct
@@ -330,12 +332,12 @@ class Visit:
         self._tally.problems.append(f"seed {self._seed}: {sentence}")
 
 
-async def pester(site: Site, seed: int, ended: asyncio.Event, *, at_once: int = 16) -> Tally:
-    """Visit SITE, IMMEDIATE_HANDLERS at a time, until ENDED."""
+async def pester(site: Site, seed: int, orders: "Orders", *, at_once: int = 16) -> Tally:
+    """Visit SITE, AT_ONCE at a time, until ORDERS end."""
     tally, seeds = Tally(), iter(range(seed, seed + 2**31))
 
     async def go_on() -> None:
-        while not ended.is_set():
+        while await orders.may_go_on():
             visit = Visit(site, next(seeds), tally)
             try:
                 await visit.go()
@@ -347,14 +349,38 @@ async def pester(site: Site, seed: int, ended: asyncio.Event, *, at_once: int = 
     return tally
 
 
+class Orders:
+    """What standard input says: ``rest``, ``go``, or its end."""
+
+    def __init__(self) -> None:
+        self._ended = False
+        self._go = asyncio.Event()
+        self._go.set()
+        asyncio.get_running_loop().add_reader(sys.stdin, self._read)
+
+    def _read(self) -> None:
+        match os.read(sys.stdin.fileno(), 4096).split()[-1:]:  # what was said last counts
+            case [b"rest"]:
+                self._go.clear()
+            case [b"go"]:
+                self._go.set()
+            case _:
+                self._ended = True
+                self._go.set()
+                asyncio.get_running_loop().remove_reader(sys.stdin)
+
+    async def may_go_on(self) -> bool:
+        """Wait while it is to rest; return whether it has not ended."""
+        await self._go.wait()
+        return not self._ended
+
+
 async def main() -> None:
     """Visit until standard input ends, and print what became of it."""
     path, port, token, seed = sys.argv[1:]
     async with Client(path) as client:
         methods = (await client.call("api.methods"))["methods"]
-    ended = asyncio.Event()
-    asyncio.get_running_loop().add_reader(sys.stdin, ended.set)
-    tally = await pester(Site(Path(path), int(port), token, tuple(methods)), int(seed), ended)
+    tally = await pester(Site(Path(path), int(port), token, tuple(methods)), int(seed), Orders())
     sys.stdout.write(json.dumps({"counts": tally.counts, "problems": tally.problems}) + "\n")
 
 
