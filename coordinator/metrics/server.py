@@ -16,6 +16,7 @@ from aiohttp import web
 from prometheus_client.exposition import choose_encoder
 
 from coordinator.metrics.collect import registry_of
+from coordinator.support.shared_task import shared_task
 from coordinator.support.values import Value
 from coordinator.web.http_server import HttpServer
 from nodes.support.errors import CanductorError
@@ -121,7 +122,7 @@ class MetricsServer:
         now_s = asyncio.get_running_loop().time()
         self._answers = {k: made for k, made in self._answers.items() if now_s - made[0] < SAME_S}
         if accept not in self._answers:
-            self._answers[accept] = (now_s, asyncio.ensure_future(self._make(accept)))
+            self._answers[accept] = (now_s, shared_task(self._make(accept)))
         return await asyncio.shield(self._answers[accept][1])
 
     async def _make(self, accept: str) -> bytes:

@@ -29,6 +29,7 @@ from coordinator.service.core.work import (
 )
 from coordinator.service.state.figures import axes, position_figures
 from coordinator.streaming.move_source import ProgramOutput
+from coordinator.support.shared_task import shared_task
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
@@ -376,7 +377,7 @@ class _StepsOfNodes:
         if loop.time() - self._answered_s < _STEPS_KEPT_S:
             return self._answer
         if self._asking is None or self._asking.done():
-            self._asking = loop.create_task(self._ask())
+            self._asking = shared_task(self._ask())
         return await asyncio.shield(self._asking)
 
     async def _ask(self) -> dict[str, int]:
