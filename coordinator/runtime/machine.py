@@ -414,7 +414,9 @@ class Machine:
         await node.restart()
 
     def _node_changed(self, node: Node) -> None:
-        if node.state is NodeState.READY:
+        if node.state is NodeState.READY and self.stopped is not None and not self._ready:
+            node.emergency_stop()  # it was not connected yet when the machine was stopped
+        elif node.state is NodeState.READY:
             self.modules.node_started(node)
         self._check_gone(node)
 

@@ -17,8 +17,8 @@ from tests.stages.served import Served, running
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
 
 
-def on_stage(folder: Path, go: Callable[[Served], Awaitable[None]]) -> None:
-    """Run GO with a service of a machine that is described by a file in FOLDER."""
+def on_stage(folder: Path, go: Callable[[Served], Awaitable[None]]) -> Stage:
+    """Run GO with a service of a machine that is described by a file in FOLDER; return its boards."""
     world = Stage(load(CLEAN), 1)
     config = folder / "printer.cfg"
     config.write_text(Path(world.description.path).read_text())
@@ -29,6 +29,7 @@ def on_stage(folder: Path, go: Callable[[Served], Awaitable[None]]) -> None:
 
     with asyncio.Runner(loop_factory=world.make_loop) as runner:
         runner.run(main())
+    return world
 
 
 async def run(stage: Served, script: str) -> None:
@@ -117,6 +118,60 @@ def test_nodes_that_are_shut_down_come_back(tmp_path: Path, command: str) -> Non
         await begun_anew(stage, 2)
         await run(stage, "G28\nG1 X5 F6000")
         assert (await counts(stage))["stepper_x"] != 0
+
+    on_stage(tmp_path, go)
+
+
+def test_nothing_begins_between_the_call_and_the_restart(tmp_path: Path) -> None:
+    """What began then was never carried out: its job printed for ever, its caller waited for ever."""
+
+    async def go(stage: Served) -> None:
+        job = stage.write_job("G28\nG1 X5 F6000\n")
+        for number in range(2, 8):
+            await stage.call("machine.restart")
+            while stage.service.starts < number:
+                for call in (stage.call("job.start", file=job), run(stage, "G28")):
+                    with pytest.raises(ApiError) as refused:
+                        await call
+                    assert refused.value.code == "not_ready"
+                await asyncio.sleep(0.003 * number)
+            await begun_anew(stage, number)
+            assert stage.service.active_job is None
+            await asyncio.sleep(0.01 * number)
+        await run(stage, "G28")
+
+    on_stage(tmp_path, go)
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.2, 0.35, 1.0])
+def test_a_stop_after_the_call_is_not_undone_by_the_restart(tmp_path: Path, after_s: float) -> None:
+    async def go(stage: Served) -> None:
+        await stage.call("machine.restart")
+        await asyncio.sleep(after_s)
+        await stage.call("machine.emergency_stop")
+        await stage.until(lambda: stage.service.starts == 2, "the next start")
+        await stage.until_state("shutdown")
+        assert "emergency stop by" in stage.service.cause
+        await stage.call("machine.restart")
+        await begun_anew(stage, 3)
+        await stage.call("machine.restart")
+        await asyncio.sleep(after_s)
+        await stage.call("machine.emergency_stop")
+        await stage.until(lambda: stage.service.starts == 4, "the next start")
+        await stage.until_state("shutdown")
+        await asyncio.sleep(0.1)
+
+    world = on_stage(tmp_path, go)
+    assert all(world.node(name).counters()["is_shutdown"] for name in ("mcu", "toolhead"))
+
+
+def test_a_firmware_restart_may_follow_a_plain_one_that_has_not_begun(tmp_path: Path) -> None:
+    async def go(stage: Served) -> None:
+        await run(stage, "G28\nG1 X20 F6000")
+        for firmware in (False, True, False):
+            await stage.call("machine.restart", firmware=firmware)
+        await begun_anew(stage, 2)
+        assert not any((await counts(stage)).values())
 
     on_stage(tmp_path, go)
 
