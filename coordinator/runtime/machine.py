@@ -175,10 +175,12 @@ class Machine:
             raise
 
     async def _begin(self) -> None:
-        for node in self.nodes.values():
-            self._check_gone(node)  # one may have failed while others still started
         if self.stopped is not None:
             raise self.stopped
+        for node in self.nodes.values():  # one may have failed while others still started
+            if node.failure is not None and self.policies[node.name] is NodePolicy.FATAL:
+                raise node.failure.with_traceback(None)
+            self._check_gone(node)
         await self.modules.connect(self, self._on_notice)
 
     async def close(self) -> None:

@@ -82,6 +82,8 @@ class Node:
         """The node's clock by sync pulses, while its bus has them; updated by the bus."""
         self.reset_first = False
         """Whether the next start resets the node even when it is configured as it should be."""
+        self.kept_configuration = False
+        """Whether the last start found it configured as it should be: what it did then, it may still do."""
         self._connector = connector
         self._build_config = build_config
         self._on_state = on_state
@@ -389,7 +391,8 @@ class Node:
     async def _configure(self, found: Message, wanted: NodeConfig) -> None:
         """Configure the node, whose state is FOUND, as WANTED."""
         self._starting_over = False
-        if not found.integer("is_config"):
+        self.kept_configuration = bool(found.integer("is_config"))
+        if not self.kept_configuration:
             for command in wanted.config_commands:
                 self._talk.send_text(command)
             self._talk.send("finalize_config", crc=wanted.crc)
