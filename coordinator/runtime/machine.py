@@ -35,6 +35,7 @@ from nodes.bus.can_bus import CanBus
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.link import IOStats, Link
+from nodes.node.absence import REQUESTED
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
 from nodes.node.states import NodeState
@@ -401,7 +402,7 @@ class Machine:
         )
 
     def _add(self, bus: CanBus | UartBus, node: Node) -> None:
-        node.reset_first = self._reset_nodes
+        node.reset_first = REQUESTED if self._reset_nodes else ""
         self.nodes[node.name] = node
         self._bus_of[node] = bus
 
@@ -413,7 +414,7 @@ class Machine:
         return build
 
     async def _bring_back(self, node: Node) -> None:
-        await node.restart()
+        await self._bus_of[node].bring_up(node)
 
     def _node_changed(self, node: Node) -> None:
         if node.state is NodeState.READY and self.stopped is not None and not self._ready:

@@ -14,6 +14,8 @@ from tests.stages.served import Served, running
 
 SCENARIOS: Final = Path("coordinator/simulate/scenarios")
 RESTARTS: Final = 12
+SILENT_S: Final = 1.3
+"""A node that does not acknowledge is lost after a second."""
 JOB: Final = "G28\n" + "G1 X100 F6000\nG1 X20 F6000\n" * 500
 
 
@@ -47,6 +49,27 @@ def test_each_restart_succeeds_at_the_first_try(tmp_path: Path, scenario: str, s
                 await stage.call("machine.restart")
                 await stage.until(lambda: stage.service.starts == number + 1, "the next start")  # noqa: B023
                 await stage.until_state("ready")
+
+    with asyncio.Runner(loop_factory=world.make_loop) as runner:
+        runner.run(main())
+
+
+@pytest.mark.parametrize("node", ["mcu", "toolhead", "zboard"])
+@pytest.mark.parametrize("kind", ["cut", "stall"])
+@pytest.mark.parametrize("at_s", [0.0, 0.3, 0.32, 0.34, 0.4, 0.6, 1.0, 1.5, 2.0, 2.3])
+def test_a_node_that_is_silent_for_a_moment_in_the_start(
+    tmp_path: Path, node: str, kind: str, at_s: float
+) -> None:
+    """It is lost, whatever the start is at, but the same start brings it back."""
+    world = Stage(load(SCENARIOS / "corexy_mixed.toml"), 1)
+
+    async def main() -> None:
+        async with running(Served(tmp_path, lambda: world.description, world.host)) as stage:
+            world.faults.add(kind, node=node, at_s=at_s, for_s=SILENT_S)
+            await stage.call("machine.restart")
+            await stage.until(lambda: stage.service.starts == 2, "the next start")
+            await stage.until(lambda: str(stage.service.state) != "startup", "its end")
+            assert str(stage.service.state) == "ready", stage.lines
 
     with asyncio.Runner(loop_factory=world.make_loop) as runner:
         runner.run(main())
