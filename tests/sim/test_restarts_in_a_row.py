@@ -6,10 +6,14 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from hypothesis import given, settings
+from hypothesis.strategies import integers
 
 from coordinator.assembly.load import load_machine
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
+from tests.profiles import examples
+from tests.sim.restarts import search
 from tests.stages.served import Served, running
 
 SCENARIOS: Final = Path("coordinator/simulate/scenarios")
@@ -73,3 +77,11 @@ def test_a_node_that_is_silent_for_a_moment_in_the_start(
 
     with asyncio.Runner(loop_factory=world.make_loop) as runner:
         runner.run(main())
+
+
+@given(seed=integers(0, 2**32 - 1))
+@settings(max_examples=examples(8))
+def test_the_first_plain_restart_is_enough_when_all_is_sound_again(seed: int) -> None:
+    """Whatever went wrong before it, also in other starts."""
+    found = search(seed)
+    assert found.ok, "\n".join([f"python -m tests.sim.restarts {seed}:{seed + 1}", *found.log])
