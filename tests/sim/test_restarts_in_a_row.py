@@ -60,7 +60,7 @@ def test_each_restart_succeeds_at_the_first_try(tmp_path: Path, scenario: str, s
 
 @pytest.mark.parametrize("node", ["mcu", "toolhead", "zboard"])
 @pytest.mark.parametrize("kind", ["cut", "stall"])
-@pytest.mark.parametrize("at_s", [0.0, 0.3, 0.32, 0.34, 0.4, 0.6, 1.0, 1.5, 2.0, 2.3])
+@pytest.mark.parametrize("at_s", [0.0, 0.32, 0.4, 0.6, 1.0])
 def test_a_node_that_is_silent_for_a_moment_in_the_start(
     tmp_path: Path, node: str, kind: str, at_s: float
 ) -> None:
@@ -79,8 +79,9 @@ def test_a_node_that_is_silent_for_a_moment_in_the_start(
         runner.run(main())
 
 
+@pytest.mark.timeout(1800)  # of all seeds of profile ``full`` together
 @given(seed=integers(0, 2**32 - 1))
-@settings(max_examples=examples(8))
+@settings(max_examples=examples(3))
 def test_the_first_plain_restart_is_enough_when_all_is_sound_again(seed: int) -> None:
     """Whatever went wrong before it, also in other starts."""
     found = search(seed)
