@@ -35,6 +35,7 @@ from nodes.bus.can_bus import CanBus
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.link import IOStats, Link
+from nodes.node.absence import REQUESTED
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
 from nodes.node.states import NodeState
@@ -175,10 +176,12 @@ class Machine:
             raise
 
     async def _begin(self) -> None:
-        for node in self.nodes.values():
-            self._check_gone(node)  # one may have failed while others still started
         if self.stopped is not None:
             raise self.stopped
+        for node in self.nodes.values():  # one may have failed while others still started
+            if node.failure is not None and self.policies[node.name] is NodePolicy.FATAL:
+                raise node.failure.with_traceback(None)
+            self._check_gone(node)
         await self.modules.connect(self, self._on_notice)
 
     async def close(self) -> None:
@@ -399,7 +402,7 @@ class Machine:
         )
 
     def _add(self, bus: CanBus | UartBus, node: Node) -> None:
-        node.reset_first = self._reset_nodes
+        node.reset_first = REQUESTED if self._reset_nodes else ""
         self.nodes[node.name] = node
         self._bus_of[node] = bus
 
@@ -411,10 +414,12 @@ class Machine:
         return build
 
     async def _bring_back(self, node: Node) -> None:
-        await node.restart()
+        await self._bus_of[node].bring_up(node)
 
     def _node_changed(self, node: Node) -> None:
-        if node.state is NodeState.READY:
+        if node.state is NodeState.READY and self.stopped is not None and not self._ready:
+            node.emergency_stop()  # it was not connected yet when the machine was stopped
+        elif node.state is NodeState.READY:
             self.modules.node_started(node)
         self._check_gone(node)
 

@@ -70,6 +70,24 @@ class Faults:
                     else:
                         self._actor.act(fault)
 
+    def add(
+        self,
+        kind: str,
+        *,
+        at_s: float,
+        for_s: float,
+        node: str = "",
+        bus: str = "",
+        share: float = 0.0,
+        data: bytes = b"",
+    ) -> ScenarioFault:
+        """Schedule a fault that is not in the scenario, in AT_S from now; options as in a scenario file."""
+        begin_ns = self._actor.now_ns() + round(at_s * NS)
+        fault = ScenarioFault(kind, node, bus, begin_ns, begin_ns + round(for_s * NS), share, 0, data)
+        self._begun.append(fault)
+        self._actor.act(fault)
+        return fault
+
     def _drawn(self, setting: FaultSetting, key: str, now_ns: int) -> list[ScenarioFault]:
         def draw(name: str) -> float:
             return self._dice.draw(getattr(setting, name), f"{key}.{name}")

@@ -1,7 +1,6 @@
 """Performs what a program has to be done while the machine stands; the program waits for it."""
 
 import asyncio
-import contextlib
 from collections.abc import Callable
 
 from coordinator.gcode.events import Done, StandstillAction
@@ -46,10 +45,16 @@ class StandstillTask:
         return True
 
     async def close(self) -> None:
-        """Cancel it and wait for its end."""
+        """Cancel it and wait for its end; whoever waits may be cancelled, too, which comes after that end."""
         self._task.cancel()
-        with contextlib.suppress(asyncio.CancelledError, CanductorError):
-            await self._task
+        try:
+            await asyncio.wait([self._task])
+        except asyncio.CancelledError:
+            await asyncio.wait([self._task])
+            raise
+        bug = None if self._task.cancelled() else self._task.exception()
+        if bug is not None and not isinstance(bug, CanductorError):
+            raise bug
 
     async def _perform(self) -> Done:
         self._has_begun = True  # never, where it was ended before its turn

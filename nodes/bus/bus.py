@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from nodes.dictionary.cache import DictionaryCache
 from nodes.link import LinkError, LinkSettings
 from nodes.link.interfaces import IoFactory, LinkInterface, LinkIoInterface, OnFrame, OnLost, OnResponses
-from nodes.node.absence import BACK_WITHIN_S, DEAF_S, REQUESTED, RETRY_S, Absence
+from nodes.node.absence import BACK_WITHIN_S, DEAF_S, LOST_IN_START, RETRY_S, Absence
 from nodes.node.board_reset import ResetMethod, SerialPort, power_cycle, pulse, reset_methods
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeLost
@@ -14,6 +14,8 @@ from nodes.node.node import Node, OnClock, OnState
 from nodes.node.request_reply import QueryTimeout
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
+
+_ENDED = (NodeState.LOST, NodeState.SHUTDOWN)
 
 
 def ignore(*_: object) -> None:
@@ -88,7 +90,7 @@ class BusBase:
         """Open the bus; wait for its device when nodes are restarted, which may have made it disappear."""
         restarted = [node.name for node in self.nodes if node.reset_first]
         limit_s = BACK_WITHIN_S if restarted else 0.0
-        why = REQUESTED if restarted else ""
+        why = next((node.reset_first for node in self.nodes if node.reset_first), "")
         absence = Absence(", ".join(restarted), limit_s, why, self._on_notice)
         while True:
             try:
@@ -103,20 +105,31 @@ class BusBase:
 
     async def _start_node(self, node: Node) -> None:
         try:
-            await self._bring_up(node)
+            await self.bring_up(node)
             self._node_started(node)
         except CanductorError:
             if node not in self._may_be_absent:
                 raise
 
-    async def _bring_up(self, node: Node) -> None:
-        """Start the node; again if the bus closes because another node on it is being reset."""
+    async def bring_up(self, node: Node) -> None:
+        """Start the node, or start it again; raises like ``Node.start``.
+
+        It is started again if the bus closes because another node on it is being reset, and once more, with a
+        reset, if it was lost after it had been reached: a start that leaves its configuration as it is must
+        not fail where one that clears it would do.
+        """
+        was_lost = False
         while True:
             try:
-                await (node.restart() if node.state is NodeState.LOST else node.start())
-            except (NodeLost, QueryTimeout, LinkError):
-                if self.outage_s() <= 0:
+                await (node.restart() if node.state in _ENDED else node.start())
+            except (NodeLost, QueryTimeout, LinkError) as error:
+                if self.outage_s() > 0:
+                    continue
+                if not node.was_reached or was_lost:
                     raise
+                was_lost = True
+                node.reset_first = LOST_IN_START
+                self._on_notice(f"{error}; the node is reset and started once more")
             else:
                 return
 

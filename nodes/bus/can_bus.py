@@ -14,6 +14,7 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
 from nodes.link import Frame, LinkSettings
 from nodes.link.interfaces import IoFactory, LinkInterface, OnFrame, OnLost, OnResponses
+from nodes.node.absence import DEAF_S
 from nodes.node.board_reset import ResetMethod
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeError, NodeLost
@@ -150,6 +151,10 @@ class CanBus(BusBase):
         """Share of the bit rate used in the last second by all senders; 0 while it is unknown."""
         return self.io.stats().load.total
 
+    def patience_s(self, uuid: Uuid) -> float:
+        """Return how long a start goes on although nothing is heard of UUID; others do not wait for long."""
+        return 0.0 if self._by_uuid[uuid] in self._may_be_absent else DEAF_S
+
     def nodeid(self, uuid: Uuid) -> int:
         """Return the id that UUID has or will get."""
         return self._nodeids[uuid]
@@ -275,7 +280,7 @@ class _CanConnector:
         return False
 
     def absence_s(self) -> float:
-        return self._bus.outage_s()
+        return max(self._bus.outage_s(), self._bus.patience_s(self._uuid))
 
     def missing(self, error: CanductorError) -> str:
         assignment, self.assignment = self.assignment, None  # the next attempt asks for the id again

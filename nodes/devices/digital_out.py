@@ -59,5 +59,11 @@ class DigitalOut(TimedOutput):
         """Switch it when the command arrives; not while a value of ``set`` is pending."""
         node.send("update_digital_out", oid=self._oid, value=self._level(on))
 
+    def _start_value(self) -> int:
+        return self._level(self._start)
+
+    def _begin_again(self, node: Node) -> None:
+        self.set_now(node, self._start)  # so that ``set_now`` is possible from now on
+
     def _level(self, on: bool) -> int:
         return int(on != self._invert)

@@ -83,6 +83,9 @@ class PwmOut(TimedOutput):
         """Set VALUE, 0..1, at CLOCK (64 bits, later than now by the transit time to the node)."""
         self._queue(node, clock, self._scaled(value))
 
+    def _start_value(self) -> int:
+        return self._scaled(self._start)
+
     def _scaled(self, value: float) -> int:
         value = min(max(value, 0.0), 1.0)
         return round((1 - value if self._invert else value) * self._full)

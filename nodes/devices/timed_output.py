@@ -9,6 +9,7 @@ only the last is sent, a little late.
 """
 
 import asyncio
+from abc import abstractmethod
 from collections import deque
 from typing import Final
 
@@ -42,11 +43,22 @@ class TimedOutput(Device):
         """Clocks and values that have no slot yet."""
         self._timer: asyncio.TimerHandle | None = None
 
+    @abstractmethod
+    def _start_value(self) -> int:
+        """Return the value with which the output begins."""
+
     def started(self, node: Node) -> None:
-        """Reset: NODE has become ready, with the output as it was configured."""
-        del node
+        """Begin with the start value: NODE has become ready.
+
+        One that kept its configuration still drives what it was last told, perhaps by another host.
+        """
         self._last_clock = 0
         self._clear()
+        if node.kept_configuration:
+            self._begin_again(node)
+
+    def _begin_again(self, node: Node) -> None:
+        self._queue(node, clock_after(node, TRANSIT_S), self._start_value())
 
     def _add_to(self, config: NodeConfig, commands: tuple[str, ...]) -> None:
         """Add it to its node's CONFIG, which has to have COMMANDS."""

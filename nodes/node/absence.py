@@ -2,7 +2,8 @@
 
 A board that was reset is away until its boot loader has ended; on USB its device disappears for that time.
 A board on a serial line may be away when the line is opened, too: opening raises DTR, which resets many
-boards, and their boot loaders are deaf for up to 3 s.
+boards, and their boot loaders are deaf for up to 3 s. On a bus it may just have been given power, or restart
+by itself, or be held up; a node that others can do without is not waited for there.
 """
 
 import asyncio
@@ -15,7 +16,7 @@ from nodes.support.errors import CanductorError
 BACK_WITHIN_S: Final = 10.0
 """From a reset until the node has to answer."""
 DEAF_S: Final = 4.0
-"""From opening a serial line until the node has to answer: a boot loader's 3 s, and the time to answer."""
+"""From the begin of a start until the node has to answer: a boot loader's 3 s, and the time to answer."""
 RETRY_S: Final = 0.1
 """Between two attempts to reach the node."""
 FIRST_NOTICE_S: Final = 1.0
@@ -23,6 +24,8 @@ FIRST_NOTICE_S: Final = 1.0
 NOTICE_INTERVAL_S: Final = 3.0
 REQUESTED: Final = "a restart of its firmware was requested"
 """Why a node is reset that is configured as it should be."""
+LOST_IN_START: Final = "it was lost while it was started"
+"""Likewise: what it still does from before may be what keeps it from answering."""
 
 
 class Absence:

@@ -15,7 +15,7 @@ from nodes.dictionary.parts import DictionaryError
 from nodes.dictionary.vocabulary import carries_identity, check_vocabulary
 from nodes.link import LinkError
 from nodes.link.interfaces import LinkInterface
-from nodes.node.absence import BACK_WITHIN_S, REQUESTED, RETRY_S, Absence
+from nodes.node.absence import BACK_WITHIN_S, RETRY_S, Absence
 from nodes.node.board_reset import ResetMethod
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.config import NodeConfig
@@ -80,8 +80,12 @@ class Node:
         self.load: NodeLoad | None = None
         self.pulse_clock: PulseClock | None = None
         """The node's clock by sync pulses, while its bus has them; updated by the bus."""
-        self.reset_first = False
-        """Whether the next start resets the node even when it is configured as it should be."""
+        self.reset_first = ""
+        """Why the next start resets the node even when it is configured as it should be; "": it does not."""
+        self.was_reached = False
+        """Whether the last start got as far as configuring the node."""
+        self.kept_configuration = False
+        """Whether the last start found it configured as it should be: what it did then, it may still do."""
         self._connector = connector
         self._build_config = build_config
         self._on_state = on_state
@@ -246,12 +250,12 @@ class Node:
 
     async def _start(self) -> None:
         """Reach the node, reset it where that is needed, configure it: every start and restart is this."""
-        self._reaching = True
+        self._reaching, self.was_reached = True, False
         try:
             keeper, wanted, found = await self._prepare()
         finally:
             self._reaching = False
-        self.reset_first = False
+        self.reset_first, self.was_reached = "", True
         await self._configure(found, wanted)
         await self._wait_for_clock(keeper)
         self._enter(NodeEvent.CONFIGURED)
@@ -270,7 +274,7 @@ class Node:
                 methods.remove(method)
                 if await self._connector.reset(method):
                     used.append(method)
-            after = f"it was reset because {REQUESTED}" if used else REQUESTED
+            after = f"it was reset because {self.reset_first}" if used else self.reset_first
             absence = self._absence(BACK_WITHIN_S, after)
         while True:
             found = await self._reach(absence)
@@ -384,12 +388,13 @@ class Node:
             return ""
         if found.integer("crc") != wanted.crc:
             return "it had another configuration"
-        return REQUESTED if self.reset_first else ""
+        return self.reset_first
 
     async def _configure(self, found: Message, wanted: NodeConfig) -> None:
         """Configure the node, whose state is FOUND, as WANTED."""
         self._starting_over = False
-        if not found.integer("is_config"):
+        self.kept_configuration = bool(found.integer("is_config"))
+        if not self.kept_configuration:
             for command in wanted.config_commands:
                 self._talk.send_text(command)
             self._talk.send("finalize_config", crc=wanted.crc)

@@ -1,7 +1,7 @@
 """A machine that begins anew: by command and by method, with its nodes reset or not, with what was saved."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -10,15 +10,23 @@ from coordinator.assembly.load import load_machine
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.save_config import SaveConfig
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.simulate.scenario import load
+from coordinator.simulate.scenario import NodeSetting, load
 from coordinator.simulate.stage import Stage
+from coordinator.support.toml_values import Range
+from coordinator.virtual_machine.plant import PlantSettings
+from nodes.support.can_protocol import BUS_STOP_ID
+from tests.stages.machine_stage import MachineStage
 from tests.stages.served import Served, running
 
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
+HEATED = Path("coordinator/simulate/machines/heated.cfg")
+HEATER, FAN, LAMP = "PA3", "PA8", "PA9"
+"""Pins of its toolhead."""
+BOOTED_S = 3.5
 
 
-def on_stage(folder: Path, go: Callable[[Served], Awaitable[None]]) -> None:
-    """Run GO with a service of a machine that is described by a file in FOLDER."""
+def on_stage(folder: Path, go: Callable[[Served], Awaitable[None]]) -> Stage:
+    """Run GO with a service of a machine that is described by a file in FOLDER; return its boards."""
     world = Stage(load(CLEAN), 1)
     config = folder / "printer.cfg"
     config.write_text(Path(world.description.path).read_text())
@@ -29,6 +37,7 @@ def on_stage(folder: Path, go: Callable[[Served], Awaitable[None]]) -> None:
 
     with asyncio.Runner(loop_factory=world.make_loop) as runner:
         runner.run(main())
+    return world
 
 
 async def run(stage: Served, script: str) -> None:
@@ -121,6 +130,60 @@ def test_nodes_that_are_shut_down_come_back(tmp_path: Path, command: str) -> Non
     on_stage(tmp_path, go)
 
 
+def test_nothing_begins_between_the_call_and_the_restart(tmp_path: Path) -> None:
+    """What began then was never carried out: its job printed for ever, its caller waited for ever."""
+
+    async def go(stage: Served) -> None:
+        job = stage.write_job("G28\nG1 X5 F6000\n")
+        for number in range(2, 8):
+            await stage.call("machine.restart")
+            while stage.service.starts < number:
+                for call in (stage.call("job.start", file=job), run(stage, "G28")):
+                    with pytest.raises(ApiError) as refused:
+                        await call
+                    assert refused.value.code == "not_ready"
+                await asyncio.sleep(0.003 * number)
+            await begun_anew(stage, number)
+            assert stage.service.active_job is None
+            await asyncio.sleep(0.01 * number)
+        await run(stage, "G28")
+
+    on_stage(tmp_path, go)
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.2, 0.35, 1.0])
+def test_a_stop_after_the_call_is_not_undone_by_the_restart(tmp_path: Path, after_s: float) -> None:
+    async def go(stage: Served) -> None:
+        await stage.call("machine.restart")
+        await asyncio.sleep(after_s)
+        await stage.call("machine.emergency_stop")
+        await stage.until(lambda: stage.service.starts == 2, "the next start")
+        await stage.until_state("shutdown")
+        assert "emergency stop by" in stage.service.cause
+        await stage.call("machine.restart")
+        await begun_anew(stage, 3)
+        await stage.call("machine.restart")
+        await asyncio.sleep(after_s)
+        await stage.call("machine.emergency_stop")
+        await stage.until(lambda: stage.service.starts == 4, "the next start")
+        await stage.until_state("shutdown")
+        await asyncio.sleep(0.1)
+
+    world = on_stage(tmp_path, go)
+    assert all(world.node(name).counters()["is_shutdown"] for name in ("mcu", "toolhead"))
+
+
+def test_a_firmware_restart_may_follow_a_plain_one_that_has_not_begun(tmp_path: Path) -> None:
+    async def go(stage: Served) -> None:
+        await run(stage, "G28\nG1 X20 F6000")
+        for firmware in (False, True, False):
+            await stage.call("machine.restart", firmware=firmware)
+        await begun_anew(stage, 2)
+        assert not any((await counts(stage)).values())
+
+    on_stage(tmp_path, go)
+
+
 def test_an_error_is_left_by_restart_once_the_file_is_put_right(tmp_path: Path) -> None:
     config = tmp_path / "printer.cfg"
 
@@ -194,3 +257,67 @@ def test_a_file_that_was_edited_is_not_overwritten(tmp_path: Path) -> None:
         assert stage.service.starts == 1
 
     on_stage(tmp_path, go)
+
+
+# ------------------------------------------------------------------------------ what nodes keep, and do not
+
+
+def heated(folder: Path, changes: str, nodes: Mapping[str, NodeSetting] | None = None) -> MachineStage:
+    """Return a machine with a heater that has the options CHANGES, described by a file in FOLDER."""
+    config = folder / "printer.cfg"
+    config.write_text(HEATED.read_text().replace("min_temp: 0", f"{changes}\nmin_temp: 0"))
+    return MachineStage(config, nodes=nodes, plant=PlantSettings())
+
+
+def serve(machine: MachineStage, folder: Path, go: Callable[[Served], Awaitable[None]]) -> None:
+    """Run GO while a service of MACHINE runs, which reads its configuration again at every start."""
+
+    async def main() -> None:
+        await asyncio.sleep(BOOTED_S)
+        async with running(Served(folder, lambda: load_machine(str(machine.config)), machine.host)) as stage:
+            await go(stage)
+
+    machine.run(main)
+
+
+@pytest.mark.parametrize("max_duration_s", [1.5, 2.4, 5.0])
+def test_outputs_of_nodes_that_keep_their_configuration_begin_again(
+    tmp_path: Path, max_duration_s: float
+) -> None:
+    """The heater's node shut down, as nobody renewed its power; fan and lamp remained as they were."""
+    machine = heated(tmp_path, f"max_duration: {max_duration_s}")
+
+    async def go(stage: Served) -> None:
+        await run(stage, "G28\nG1 X20 F6000\nM104 S210\nM106 S255\nSET_PIN PIN=lamp VALUE=0")
+        await asyncio.sleep(2.0)
+        assert machine.edges(LAMP, "toolhead")[-1][1] == 0
+        assert machine.edges(HEATER, "toolhead")[-1][1] == machine.edges(FAN, "toolhead")[-1][1] == 1
+        await run(stage, "RESTART")
+        await begun_anew(stage, 2)
+        await asyncio.sleep(0.3)
+        assert machine.edges(HEATER, "toolhead")[-1][1] == 0
+        assert machine.edges(FAN, "toolhead")[-1][1] == 0
+        assert machine.edges(LAMP, "toolhead")[-1][1] == 1, "as at first"
+        await asyncio.sleep(2 * max_duration_s)
+        assert str(stage.service.state) == "ready"
+        assert (await counts(stage))["stepper_x"] != 0, "no node was reset"
+
+    serve(machine, tmp_path, go)
+
+
+def test_a_node_that_shuts_down_while_others_still_start(tmp_path: Path) -> None:
+    """It was ready already: the same start resets all nodes, as it does for one that was not."""
+    slow = NodeSetting(config_reset="unknown", boot_s=Range(BOOTED_S, BOOTED_S))
+    stranger = NodeSetting(uuid="aaaaaaaaaaaa", bus="can0")
+    machine = heated(tmp_path, "", {"mcu": slow, "stranger": stranger})
+
+    async def go(stage: Served) -> None:
+        machine.config.write_text(machine.config.read_text() + "[output_pin other]\npin: PF7\n")
+        stops_bus = machine.node("stranger").controller
+        assert stops_bus is not None
+        machine.at(3.0, lambda: stops_bus.send(BUS_STOP_ID, bytes(2)))
+        await run(stage, "RESTART")
+        await begun_anew(stage, 2)
+        assert any("reset and started again" in line for line in stage.lines), stage.lines
+
+    serve(machine, tmp_path, go)

@@ -6,14 +6,20 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from hypothesis import given, settings
+from hypothesis.strategies import integers
 
 from coordinator.assembly.load import load_machine
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
+from tests.profiles import examples
+from tests.sim.restarts import search
 from tests.stages.served import Served, running
 
 SCENARIOS: Final = Path("coordinator/simulate/scenarios")
 RESTARTS: Final = 12
+SILENT_S: Final = 1.3
+"""A node that does not acknowledge is lost after a second."""
 JOB: Final = "G28\n" + "G1 X100 F6000\nG1 X20 F6000\n" * 500
 
 
@@ -50,3 +56,33 @@ def test_each_restart_succeeds_at_the_first_try(tmp_path: Path, scenario: str, s
 
     with asyncio.Runner(loop_factory=world.make_loop) as runner:
         runner.run(main())
+
+
+@pytest.mark.parametrize("node", ["mcu", "toolhead", "zboard"])
+@pytest.mark.parametrize("kind", ["cut", "stall"])
+@pytest.mark.parametrize("at_s", [0.0, 0.32, 0.4, 0.6, 1.0])
+def test_a_node_that_is_silent_for_a_moment_in_the_start(
+    tmp_path: Path, node: str, kind: str, at_s: float
+) -> None:
+    """It is lost, whatever the start is at, but the same start brings it back."""
+    world = Stage(load(SCENARIOS / "corexy_mixed.toml"), 1)
+
+    async def main() -> None:
+        async with running(Served(tmp_path, lambda: world.description, world.host)) as stage:
+            world.faults.add(kind, node=node, at_s=at_s, for_s=SILENT_S)
+            await stage.call("machine.restart")
+            await stage.until(lambda: stage.service.starts == 2, "the next start")
+            await stage.until(lambda: str(stage.service.state) != "startup", "its end")
+            assert str(stage.service.state) == "ready", stage.lines
+
+    with asyncio.Runner(loop_factory=world.make_loop) as runner:
+        runner.run(main())
+
+
+@pytest.mark.timeout(1800)  # of all seeds of profile ``full`` together
+@given(seed=integers(0, 2**32 - 1))
+@settings(max_examples=examples(3))
+def test_the_first_plain_restart_is_enough_when_all_is_sound_again(seed: int) -> None:
+    """Whatever went wrong before it, also in other starts."""
+    found = search(seed)
+    assert found.ok, "\n".join([f"python -m tests.sim.restarts {seed}:{seed + 1}", *found.log])

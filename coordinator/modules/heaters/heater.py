@@ -140,7 +140,10 @@ class Heater:
                 self._live.save(self.name, option, text)
 
     def end(self, cause: str) -> None:
-        """Stop acting: the nodes have switched their outputs off."""
+        """Stop acting, and switch off; when the machine was stopped, the nodes have done that."""
+        if self._on and self._live is not None and self._live.machine.stopped is None:
+            self._turn_off(self._live)
+        self._on = False
         self._live = self._stale_check = None
         self.target_c = self.power = 0.0
         self._report_held(self._holding.end())
@@ -339,15 +342,19 @@ class Heater:
                 f" check node {self.input.node} and its wires"
             )
 
+    def _turn_off(self, live: "ModuleContext") -> None:
+        if live.node(self.node).state is NodeState.READY:
+            with contextlib.suppress(CanductorError):  # then its own max_duration ends it
+                clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)
+                self._output.set(live.node(self.node), clock, 0.0)
+
     def _switch_off(self, why: str) -> None:
         """Clear the target: the node of the heater or of its sensor, which may be absent, is gone."""
         live, was, on = self._live, self.target_c, self._on
         self.target_c, self.power, self._on = 0.0, 0.0, False
         self._off_because = f"heater {self.key} was turned off: {why}"
-        if on and live is not None and live.node(self.node).state is NodeState.READY:
-            with contextlib.suppress(CanductorError):  # then its own max_duration ends it
-                clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)
-                self._output.set(live.node(self.node), clock, 0.0)
+        if on and live is not None:
+            self._turn_off(live)
         self.input.wake()
         if was > 0 and live is not None:
             live.say(f"heater {self.key} was turned off; its target ({was:g} °C) was cleared: {why}")

@@ -145,7 +145,9 @@ class MachineService:
         self._reset_nodes = False
         """At the next start, whatever their configuration."""
         self._asked_to_stop: str | None = None
-        """By somebody, while it starts."""
+        """By somebody, while it starts, or is about to start again."""
+        self._closing: Machine | None = None
+        """The one before, while it is closed."""
 
     # ------------------------------------------------------------------------------------------- life
 
@@ -162,7 +164,6 @@ class MachineService:
             while True:
                 await self._live_once()
                 await self._restart.wait()
-                self._asked_to_stop = None
                 await self._let_go()
         except asyncio.CancelledError:
             await self._stop_if_moving()
@@ -220,7 +221,7 @@ class MachineService:
 
     async def _live_once(self) -> None:
         """Start, move, and return when that is over; ``state`` has the reason."""
-        self._restart.clear()
+        self._restart.clear()  # without an await up to STARTUP: a stop is not missed
         self.confirmed_s = {}
         self.starts += 1
         self._enter(ServiceState.STARTUP)
@@ -323,16 +324,18 @@ class MachineService:
             await machine.confirm_stop()
 
     async def _let_go(self) -> None:
-        machine, self.machine, self.motion = self.machine, None, None
-        if machine is not None:
-            await machine.close()
+        self._closing = self.machine or self._closing  # also one whose close was cancelled
+        self.machine = self.motion = None
+        if self._closing is not None:
+            await self._closing.close()
+            self._closing = None
 
     # ------------------------------------------------------------------------------------------- doing
 
     def emergency_stop(self, who: str) -> None:
         """Stop all nodes, ahead of everything queued; takes effect before this returns."""
         cause = f"{BY_USER} {who}"
-        if self.state is ServiceState.STARTUP:
+        if self.state is ServiceState.STARTUP or self._restart.is_set():
             self._asked_to_stop = cause  # whatever machine is there by then
         if self.machine is None:
             return
@@ -360,7 +363,9 @@ class MachineService:
         """
         if self.state is ServiceState.STARTUP:
             raise ApiError("busy", "the machine is starting already")
-        if self.state not in (ServiceState.SHUTDOWN, ServiceState.ERROR):
+        if self._restart.is_set():
+            firmware |= self._reset_nodes
+        elif self.state not in (ServiceState.SHUTDOWN, ServiceState.ERROR):
             motion = self.ready_motion()
             if motion.feeder.busy or not motion.standing:
                 raise ApiError("busy", "the machine moves; wait until it stands, or cancel the job first")
@@ -373,6 +378,7 @@ class MachineService:
         self._restart_now(firmware)
 
     def _restart_now(self, firmware: bool) -> None:
+        self._asked_to_stop = None
         self._reset_nodes = firmware
         self._restart.set()
         if self.motion is not None:
@@ -441,6 +447,8 @@ class MachineService:
     def ready_motion(self) -> Motion:
         """Return what moves the machine; raises ApiError when that is not possible now."""
         motion = self.motion
+        if self._restart.is_set():  # what is begun now would never be done
+            raise ApiError("not_ready", "the machine is about to restart; wait until it is ready")
         if self.state is ServiceState.SHUTDOWN:
             raise ApiError("stopped", f"the machine stopped: {self.cause}; machine.restart starts it again")
         if motion is None or self.state in (ServiceState.STARTUP, ServiceState.ERROR):

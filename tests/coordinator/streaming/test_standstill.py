@@ -42,6 +42,32 @@ def test_what_is_ended_tidies_up_though_it_is_looked_at_meanwhile() -> None:
     assert (event.over, event.moved, event.done, event.failure) == (True, True, None, "")
 
 
+def test_a_cancel_of_whoever_waits_for_the_end_is_not_lost() -> None:
+    """A service that was ended right behind an emergency stop went on, and waited for a restart."""
+    steps: list[int] = []
+
+    async def perform() -> Done:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            for step in range(5):
+                await asyncio.sleep(0)
+                steps.append(step)
+        raise AssertionError
+
+    async def go() -> asyncio.Task[None]:
+        task = StandstillTask(StandstillAction(1, 0.0, perform, None))
+        await asyncio.sleep(0)
+        closing = asyncio.create_task(task.close())
+        await asyncio.sleep(0)
+        closing.cancel()
+        await asyncio.wait([closing])
+        return closing
+
+    assert asyncio.run(go()).cancelled()
+    assert steps == [0, 1, 2, 3, 4]
+
+
 def test_what_fails_is_told_and_may_have_moved() -> None:
     async def perform() -> Done:
         raise CanductorError("no switch")
