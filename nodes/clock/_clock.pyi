@@ -1,4 +1,4 @@
-"""cffi module; the functions are documented in linear.h and normal.h."""
+"""cffi module; the functions are documented in linear.h, normal.h, start_fit.h and pulse_parabola.h."""
 
 from typing import Any
 

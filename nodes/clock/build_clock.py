@@ -7,7 +7,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from nodes.support.native_build import builder
 
-NAMES = ("linear", "normal")
+NAMES = ("linear", "normal", "start_fit", "pulse_parabola")
 
 ffibuilder = builder(
     "nodes.clock._clock",

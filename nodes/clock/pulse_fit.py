@@ -4,37 +4,26 @@ A sync pulse is one CAN frame: every node latches its clock when the frame has e
 on a bus within a bit time. The latency of the receive interrupts differs: usually by a fraction of a
 microsecond, sometimes by much more, on either side. So the difference of the two clocks is fitted by a
 parabola (crystals warm up at different rates), and readings are weighted less the further off and the older
-they are.
+they are. The arithmetic that goes over all pairs is in pulse_parabola.c.
 """
 
-import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from nodes.clock._clock import ffi, lib
 from nodes.clock.clock import Ticks
 
-FADE_S: Final = 8.0
-"""Chosen with simulated ramps of 20 ppm in 600 s: a shorter time follows their start faster, a longer one
-has less noise."""
-PAIRS_MAX: Final = 64
+PAIRS_MAX: Final[int] = lib.PULSE_PAIRS_MAX
 SETTLE_PAIRS: Final = 24
 SETTLE_S: Final = 1.0
 """The rate is known to about 0.2 ppm after so many pairs over so long."""
 BEND_S: Final = 6.0
 """Seconds ahead for which a curvature is extrapolated at most."""
-JITTER_FLOOR_S: Final = 0.3e-6
-"""Least standard deviation of a reading: about the jitter of receive interrupts on an idle chip."""
 RATE_PRIOR: Final = 1e-3
 CURVATURE_PRIOR_PER_S: Final = 1e-7
 """Standard deviations for two crystals before anything is measured."""
-ROBUST: Final = 3.0
-"""Readings further off than so many standard deviations lose weight with the square of that."""
-ROUNDS: Final = 4
 JUMP_S: Final = 1e-3
 """No two crystals diverge by so much between two pulses: one of the nodes restarted."""
 REACH_S: Final = 1.5
@@ -78,12 +67,6 @@ class PulseLine:
         return self.offset_s + self.rate * t + self.curvature_per_s * bend_s * bend_s / 2
 
 
-def _noise(off_s: NDArray[np.float64]) -> float:
-    """Return the median deviation of readings, scaled to the standard deviation of a normal distribution."""
-    ranked, half = np.sort(off_s), len(off_s) // 2  # np.median takes ten times as long for so few values
-    return max(JITTER_FLOOR_S, 1.4826 * float(ranked[half] + ranked[~half]) / 2)
-
-
 class PulseFit:
     """Fits the clock of a node (FREQ_HZ nominal) to the reference node's (REFERENCE_HZ nominal)."""
 
@@ -91,8 +74,7 @@ class PulseFit:
         self._reference_hz = reference_hz
         self._freq_hz = freq_hz
         self._pairs: deque[tuple[Ticks, Ticks]] = deque(maxlen=PAIRS_MAX)
-        self._off_s: NDArray[np.float64]
-        """Deviation of the pairs from the newest fit."""
+        self._parabola: Any = ffi.new("struct pulse_parabola *")
         self.line: PulseLine | None = None
         """The newest fit; None before the first pair."""
         self.restarts = 0
@@ -120,7 +102,7 @@ class PulseFit:
             if self._pairs and self._parted(self._pairs[-1], pair):
                 self._pairs.clear()
             self._pairs.append(pair)
-        self.line = self._fit(np.zeros(len(self._pairs))) if self._pairs else None
+        self.line = self._fit([0.0] * len(self._pairs)) if self._pairs else None
 
     def _parted(self, earlier: tuple[Ticks, Ticks], later: tuple[Ticks, Ticks]) -> bool:
         passed_s = (later[0] - earlier[0]) / self._reference_hz
@@ -132,27 +114,18 @@ class PulseFit:
         off_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
         return passed_s <= 0 or off_s > JUMP_S + RATE_PRIOR * passed_s
 
-    def _fit(self, off_s: NDArray[np.float64]) -> PulseLine:
+    def _fit(self, off_s: Sequence[float]) -> PulseLine:
         """Fit the pairs, whose known deviations are OFF_S."""
         last_reference, last_ticks = self._pairs[-1]
-        pairs = np.array(self._pairs, dtype=np.int64)
-        t = (pairs[:, 0] - last_reference) / self._reference_hz
-        y = (pairs[:, 1] - last_ticks) / self._freq_hz - t
-        rows = np.stack([np.ones_like(t), t, t * t / 2], axis=1)
-        fade = np.exp(t / FADE_S)
-        hold = np.diag([0.0, RATE_PRIOR**-2, CURVATURE_PRIOR_PER_S**-2])
-        noise_s = _noise(off_s)
-        for _ in range(ROUNDS):
-            trust = np.minimum(1.0, (ROBUST * noise_s / np.maximum(off_s, JITTER_FLOOR_S)) ** 2)
-            weight = fade * trust / noise_s**2
-            normal = rows.T @ (rows * weight[:, None]) + hold
-            fitted = np.linalg.solve(normal, rows.T @ (weight * y))
-            off_s = np.abs(y - rows @ fitted)
-            noise_s = _noise(off_s)
-        self._off_s = off_s
-        offset_s, rate, curvature_per_s = (float(value) for value in fitted)
-        ahead = np.array([1.0, REACH_S, REACH_S**2 / 2])
-        variance = float(ahead @ np.linalg.solve(normal, ahead))
+        at_s = [(reference - last_reference) / self._reference_hz for reference, _ in self._pairs]
+        own_s = [(ticks - last_ticks) / self._freq_hz for _, ticks in self._pairs]
+        parabola = self._parabola
+        parabola.count = len(at_s)
+        parabola.at_s = at_s
+        parabola.parted_s = [own - t for own, t in zip(own_s, at_s, strict=True)]
+        parabola.off_s = off_s
+        sd_s = lib.pulse_parabola_fit(parabola, RATE_PRIOR, CURVATURE_PRIOR_PER_S, REACH_S)
+        offset_s, rate, curvature_per_s = parabola.fitted
         return PulseLine(
             last_reference,
             last_ticks,
@@ -161,14 +134,14 @@ class PulseFit:
             offset_s,
             rate,
             curvature_per_s,
-            CONFIDENCE * math.sqrt(variance) + noise_s,
+            CONFIDENCE * sd_s + parabola.noise_s,
         )
 
-    def _off_the_last_line(self) -> NDArray[np.float64]:
+    def _off_the_last_line(self) -> list[float]:
         """Return the deviation of pairs from the last fit, so that a late latch cannot bend the new one."""
         line, count = self.line, len(self._pairs)
         if line is None or count < SETTLE_PAIRS:
-            return np.zeros(count)
+            return [0.0] * count
         reference, ticks = self._pairs[-1]
         newest_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
-        return np.append(self._off_s, newest_s)[-count:]
+        return [*ffi.unpack(self._parabola.off_s, self._parabola.count), newest_s][-count:]

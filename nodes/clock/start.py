@@ -2,22 +2,23 @@
 
 Expectation propagation: every bound (see fit.py) is replaced by the Gaussian factor that gives the belief
 the same mean and variance as the bound itself would. All factors are refined with each new sample, so the
-first samples are evaluated again with what is known now, and a bad start does no harm.
+first samples are evaluated again with what is known now, and a bad start does no harm. The arithmetic that
+goes over all bounds is in start_fit.c.
 """
 
 from bisect import insort
-from typing import Final
+from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
+from nodes.clock._clock import ffi, lib
+from nodes.clock.fit import CURVATURE_SD, LEAST_SPREAD_S, LOOSE, NOISE, RATE_SD
 
-from nodes.clock.fit import CURVATURE_SD, LEAST_SPREAD_S, LOOSE, NOISE, RATE_SD, hazard
-
+START_SAMPLES: Final[int] = lib.START_SAMPLES
+"""Number of samples fitted together at most."""
 SWEEPS: Final = 2
 """Refinements with each new sample. With one, the error bound is too small twice as often; more make no
 significant difference in bench/clock.py."""
 DAMPING: Final = 0.6
-Array = NDArray[np.float64]
+"""Share of the way to its new value that a factor moves in a refinement."""
 
 
 class Start:
@@ -26,11 +27,7 @@ class Start:
     def __init__(self) -> None:
         self._trips_s: list[float] = []
         """Sorted."""
-        # For every exchange two bounds, and the factors that replace them:
-        self._rows: Array = np.zeros((0, 4))
-        self._bounds: Array = np.zeros(0)
-        self._precision: Array = np.zeros(0)
-        self._shift: Array = np.zeros(0)
+        self._fit: Any = ffi.new("struct start_fit *")
         self.spread_s = 0.0
         """Mean excess over the shortest delay, one way."""
 
@@ -40,34 +37,48 @@ class Start:
         return len(self._trips_s)
 
     def add(self, at_s: float, lead_s: float, round_trip_s: float) -> tuple[list[float], list[list[float]]]:
-        """Process an exchange; return state and covariance at AT_S, which must not decrease."""
+        """Process an exchange; return state and covariance at AT_S, which must not decrease.
+
+        IndexError after START_SAMPLES.
+        """
+        fit, way_s = self._fit, round_trip_s / 2
+        exchange = fit.exchanges[fit.count]
+        exchange.at_s = at_s
+        exchange.bound_s = way_s + lead_s, way_s - lead_s
+        fit.count += 1
         is_fastest = not self._trips_s or round_trip_s < self._trips_s[0]
         insort(self._trips_s, round_trip_s)
-        bend, way_s = at_s * at_s / 2, round_trip_s / 2
-        both = (1.0, at_s, bend, 1.0), (-1.0, -at_s, -bend, 1.0)
-        self._rows = np.concatenate((self._rows, both))
-        self._bounds = np.concatenate((self._bounds, (way_s + lead_s, way_s - lead_s)))
-        self._precision = np.concatenate((self._precision, np.zeros(2)))
-        self._shift = np.concatenate((self._shift, np.zeros(2)))
         if is_fastest:
             self._expect(lead_s, round_trip_s)
         guess = self._guess()
         for _ in range(SWEEPS):
-            self._sweep(guess)
-            self._solve()
-        move = np.array(
-            ((1.0, at_s, bend, 0.0), (0.0, 1.0, at_s, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-        )
-        state: list[float] = (move @ self._mean).tolist()
-        moved: list[list[float]] = (move @ self._covariance @ move.T).tolist()
-        return state, moved
+            if self.samples >= 6:
+                near_s = lib.start_fit_gaps(fit, 5 * self.spread_s)
+                self.spread_s = max((near_s + 2 * guess) / (2 * self.samples + 0.5), LEAST_SPREAD_S)
+            spread_s = self.spread_s
+            lib.start_fit_sweep(fit, spread_s, NOISE * spread_s, LOOSE * spread_s, DAMPING)
+            lib.start_fit_solve(fit)
+        return self._moved(at_s)
+
+    def _moved(self, at_s: float) -> tuple[list[float], list[list[float]]]:
+        """Return state and covariance, which the fit has for time 0, for AT_S."""
+        state, covariance = list(self._fit.mean), [list(row) for row in self._fit.covariance]
+        bend = at_s * at_s / 2
+        for row in (state, *covariance):
+            row[0] += row[1] * at_s + row[2] * bend
+            row[1] += row[2] * at_s
+        lead, rate, curvature, _ = covariance
+        for i in range(len(state)):
+            lead[i] += rate[i] * at_s + curvature[i] * bend
+            rate[i] += curvature[i] * at_s
+        return state, covariance
 
     def _expect(self, lead_s: float, fastest_s: float) -> None:
         """Set the prior belief, without any bound, given the fastest exchange."""
-        prior = np.array((fastest_s, RATE_SD, CURVATURE_SD, fastest_s / 3)) ** -2.0
-        self._prior = np.diag(prior)
-        self._pull = prior * (lead_s, 0.0, 0.0, fastest_s / 3)
-        self._solve()
+        prior = [sd**-2.0 for sd in (fastest_s, RATE_SD, CURVATURE_SD, fastest_s / 3)]
+        self._fit.prior = prior
+        self._fit.pull = prior[0] * lead_s, 0.0, 0.0, prior[3] * fastest_s / 3
+        lib.start_fit_solve(self._fit)
 
     def _guess(self) -> float:
         """Return the mean excess delay, estimated from the spread of the round trips."""
@@ -79,28 +90,3 @@ class Start:
         if count < 6:
             self.spread_s = max(guess, LEAST_SPREAD_S)
         return guess
-
-    def _solve(self) -> None:
-        information = self._prior + (self._rows.T * self._precision) @ self._rows
-        self._covariance: Array = np.asarray(np.linalg.inv(information), dtype=np.float64)
-        self._mean: Array = self._covariance @ (self._pull + self._shift @ self._rows)
-
-    def _sweep(self, guess: float) -> None:
-        variance = ((self._rows @ self._covariance) * self._rows).sum(axis=1)
-        middle = self._rows @ self._mean
-        gap = self._bounds - middle
-        if len(gap) >= 12:
-            near = float(np.minimum(np.maximum(gap, 0.0), 5 * self.spread_s).sum())
-            self.spread_s = max((near + 2 * guess) / (len(gap) + 0.5), LEAST_SPREAD_S)
-        # Each bound is applied to the belief from all the others.
-        other = 1 / np.maximum(1 / variance - self._precision, 1e-3 / variance)
-        centre = other * (middle / variance - self._shift)
-        tilt = (gap < LOOSE * self.spread_s) / self.spread_s
-        s = np.sqrt(other + (NOISE * self.spread_s) ** 2)
-        k = (self._bounds - centre) / s - tilt * s
-        r = np.array([hazard(x) for x in k.tolist()])
-        cut = np.minimum(r * (k + r), 1 - 1e-9) / (s * s)
-        push = tilt - r / s
-        left = 1 - other * cut
-        self._precision += DAMPING * (cut / left - self._precision)
-        self._shift += DAMPING * ((centre * cut + push) / left - self._shift)
