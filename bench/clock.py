@@ -12,7 +12,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from nodes.clock.clock import START_SAMPLES, ClockEstimator
+from nodes.clock.clock import ClockEstimator
+from nodes.clock.start import START_SAMPLES
 from tests.nodes import clock_traces as traces
 
 SHARED = Path(__file__).parents[1] / ".." / "shared" / "data" / "clock"

@@ -16,7 +16,7 @@ from typing import Final, NewType
 
 from nodes.clock.blend import Blend
 from nodes.clock.fit import Filter
-from nodes.clock.start import Start
+from nodes.clock.start import START_SAMPLES, Start
 
 HostTime = NewType("HostTime", int)
 """Nanoseconds of the host's CLOCK_MONOTONIC."""
@@ -30,8 +30,6 @@ SETTLE_INTERVAL_NS: Final = 50_000_000
 """After the burst, up to SETTLE_SAMPLES: two seconds after the start the rate is known to some 10 ppm."""
 SAMPLE_INTERVAL_NS: Final = 984_300_000
 """Not a divisor or multiple of a second: periodic work on a node must not meet every sample."""
-START_SAMPLES: Final = 64
-"""Number of samples fitted together before the filter continues alone."""
 REMEMBERED: Final = 160
 """Number of exchanges among which the fastest is sought."""
 CONTRADICTIONS: Final = 3

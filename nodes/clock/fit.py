@@ -11,6 +11,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from nodes.clock._clock import lib
+
 SIZE: Final = 5
 RATE_SD: Final = 1.5e-4
 """Standard deviation of a clock's rate against its nominal one, before anything is measured."""
@@ -37,10 +39,7 @@ OUTLIERS: Final = 1e-4
 
 def hazard(k: float) -> float:
     """Return φ(k)/Φ(k) of the normal distribution, for any K without underflow."""
-    if k < -25.0:
-        x = 1 / k  # enough terms for an accurate difference of r * (k + r), about 1 - x**2, to 1
-        return -k - x + 2 * x**3 - 10 * x**5
-    return math.exp(-k * k / 2) * 0.3989422804014327 / (0.5 * math.erfc(-k * 0.7071067811865476))
+    return float(lib.normal_hazard(k))
 
 
 def log_share(k: float) -> float:

@@ -4,36 +4,26 @@ A sync pulse is one CAN frame: every node latches its clock when the frame has e
 on a bus within a bit time. The latency of the receive interrupts differs: usually by a fraction of a
 microsecond, sometimes by much more, on either side. So the difference of the two clocks is fitted by a
 parabola (crystals warm up at different rates), and readings are weighted less the further off and the older
-they are.
+they are. The arithmetic that goes over all pairs is in pulse_parabola.c.
 """
 
-import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from operator import mul
-from typing import Final
+from typing import Any, Final
 
+from nodes.clock._clock import ffi, lib
 from nodes.clock.clock import Ticks
-from nodes.support.linear import solve
 
-FADE_S: Final = 8.0
-"""Chosen with simulated ramps of 20 ppm in 600 s: a shorter time follows their start faster, a longer one
-has less noise."""
-PAIRS_MAX: Final = 64
+PAIRS_MAX: Final[int] = lib.PULSE_PAIRS_MAX
 SETTLE_PAIRS: Final = 24
 SETTLE_S: Final = 1.0
 """The rate is known to about 0.2 ppm after so many pairs over so long."""
 BEND_S: Final = 6.0
 """Seconds ahead for which a curvature is extrapolated at most."""
-JITTER_FLOOR_S: Final = 0.3e-6
-"""Least standard deviation of a reading: about the jitter of receive interrupts on an idle chip."""
 RATE_PRIOR: Final = 1e-3
 CURVATURE_PRIOR_PER_S: Final = 1e-7
 """Standard deviations for two crystals before anything is measured."""
-ROBUST: Final = 3.0
-"""Readings further off than so many standard deviations lose weight with the square of that."""
-ROUNDS: Final = 4
 JUMP_S: Final = 1e-3
 """No two crystals diverge by so much between two pulses: one of the nodes restarted."""
 REACH_S: Final = 1.5
@@ -77,12 +67,6 @@ class PulseLine:
         return self.offset_s + self.rate * t + self.curvature_per_s * bend_s * bend_s / 2
 
 
-def _noise(off_s: Sequence[float]) -> float:
-    """Return the median deviation of readings, scaled to the standard deviation of a normal distribution."""
-    ranked, half = sorted(off_s), len(off_s) // 2
-    return max(JITTER_FLOOR_S, 1.4826 * (ranked[half] + ranked[~half]) / 2)
-
-
 class PulseFit:
     """Fits the clock of a node (FREQ_HZ nominal) to the reference node's (REFERENCE_HZ nominal)."""
 
@@ -90,8 +74,7 @@ class PulseFit:
         self._reference_hz = reference_hz
         self._freq_hz = freq_hz
         self._pairs: deque[tuple[Ticks, Ticks]] = deque(maxlen=PAIRS_MAX)
-        self._off_s: list[float]
-        """Deviation of the pairs from the newest fit."""
+        self._parabola: Any = ffi.new("struct pulse_parabola *")
         self.line: PulseLine | None = None
         """The newest fit; None before the first pair."""
         self.restarts = 0
@@ -131,23 +114,18 @@ class PulseFit:
         off_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
         return passed_s <= 0 or off_s > JUMP_S + RATE_PRIOR * passed_s
 
-    def _fit(self, off_s: list[float]) -> PulseLine:
+    def _fit(self, off_s: Sequence[float]) -> PulseLine:
         """Fit the pairs, whose known deviations are OFF_S."""
         last_reference, last_ticks = self._pairs[-1]
-        times = [(reference - last_reference) / self._reference_hz for reference, _ in self._pairs]
-        partings = [
-            (ticks - last_ticks) / self._freq_hz - t for (_, ticks), t in zip(self._pairs, times, strict=True)
-        ]
-        readings = [(t, t * t / 2, y, math.exp(t / FADE_S)) for t, y in zip(times, partings, strict=True)]
-        noise_s = _noise(off_s)
-        for _ in range(ROUNDS):
-            normal, fitted = _weighted_parabola(readings, off_s, noise_s)
-            offset_s, rate, curvature_per_s = fitted
-            off_s = [abs(y - offset_s - rate * t - curvature_per_s * bend) for t, bend, y, _ in readings]
-            noise_s = _noise(off_s)
-        self._off_s = off_s
-        ahead = (1.0, REACH_S, REACH_S**2 / 2)
-        variance = sum(map(mul, ahead, solve(normal, ahead)))
+        at_s = [(reference - last_reference) / self._reference_hz for reference, _ in self._pairs]
+        own_s = [(ticks - last_ticks) / self._freq_hz for _, ticks in self._pairs]
+        parabola = self._parabola
+        parabola.count = len(at_s)
+        parabola.at_s = at_s
+        parabola.parted_s = [own - t for own, t in zip(own_s, at_s, strict=True)]
+        parabola.off_s = off_s
+        sd_s = lib.pulse_parabola_fit(parabola, RATE_PRIOR, CURVATURE_PRIOR_PER_S, REACH_S)
+        offset_s, rate, curvature_per_s = parabola.fitted
         return PulseLine(
             last_reference,
             last_ticks,
@@ -156,7 +134,7 @@ class PulseFit:
             offset_s,
             rate,
             curvature_per_s,
-            CONFIDENCE * math.sqrt(variance) + noise_s,
+            CONFIDENCE * sd_s + parabola.noise_s,
         )
 
     def _off_the_last_line(self) -> list[float]:
@@ -166,28 +144,4 @@ class PulseFit:
             return [0.0] * count
         reference, ticks = self._pairs[-1]
         newest_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
-        return [*self._off_s, newest_s][-count:]
-
-
-def _weighted_parabola(
-    readings: Sequence[tuple[float, float, float, float]], off_s: Sequence[float], noise_s: float
-) -> tuple[list[list[float]], list[float]]:
-    """Return the matrix of the normal equations of READINGS, and their solution.
-
-    READINGS: time, half its square, value, weight. Those further OFF_S than usual lose weight.
-    """
-    limit_s = ROBUST * noise_s
-    weights = wt = wb = wtt = wtb = wbb = wy = wty = wby = 0.0
-    for (t, bend, y, fade), off in zip(readings, off_s, strict=True):
-        weight = fade if off <= limit_s else fade * (limit_s / max(off, JITTER_FLOOR_S)) ** 2
-        by_t, by_bend = weight * t, weight * bend
-        weights, wt, wb, wy = weights + weight, wt + by_t, wb + by_bend, wy + weight * y
-        wtt, wtb, wbb = wtt + by_t * t, wtb + by_t * bend, wbb + by_bend * bend
-        wty, wby = wty + by_t * y, wby + by_bend * y
-    scale = noise_s**-2
-    normal = [
-        [scale * weights, scale * wt, scale * wb],
-        [scale * wt, scale * wtt + RATE_PRIOR**-2, scale * wtb],
-        [scale * wb, scale * wtb, scale * wbb + CURVATURE_PRIOR_PER_S**-2],
-    ]
-    return normal, solve(normal, (scale * wy, scale * wty, scale * wby))
+        return [*ffi.unpack(self._parabola.off_s, self._parabola.count), newest_s][-count:]

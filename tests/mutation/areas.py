@@ -11,7 +11,7 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
     "objects": ("firmware/objects/*.[ch]",),
     "net": ("firmware/net/*.[ch]",),
     "link": ("nodes/link/*/*.[ch]", "nodes/link/*.py"),
-    "clock": ("nodes/clock/*.py", "nodes/node/clock_keeper.py"),
+    "clock": ("nodes/clock/*.[ch]", "nodes/clock/*.py", "nodes/node/clock_keeper.py"),
     "homing": (
         "coordinator/runtime/moves/homing.py",
         "coordinator/modules/homing/homing.py",
@@ -67,6 +67,7 @@ may fail them, which would count as a killed mutant."""
 MODULES: Final = (
     "nodes/virtual/build_sim.py",
     "nodes/link/build_link.py",
+    "nodes/clock/build_clock.py",
     "coordinator/motion/steps/build_steps.py",
 )
 """Build scripts of the extension modules that contain mutated C."""

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from nodes.clock.clock import CONTRADICTIONS, GAP_NS, START_SAMPLES, ClockEstimator, HostTime
+from nodes.clock.clock import CONTRADICTIONS, GAP_NS, ClockEstimator, HostTime
+from nodes.clock.start import START_SAMPLES
 
 FREQ_HZ = 168_000_000
 SECOND_NS = 1_000_000_000
