@@ -3,7 +3,7 @@ SIM_SEEDS ?= 2000
 SEED ?= 1
 SAMPLE ?= 300
 AREA ?=
-MINUTES ?= 15
+MINUTES ?= 120
 STEPS ?=
 
 .PHONY: thorough sim loss mutants mutation soak arm

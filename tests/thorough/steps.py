@@ -31,7 +31,7 @@ class Amount:
     sample: int = 300
     seed: int = 1
     fuzz_s: int = 600
-    soak_minutes: float = 15.0
+    soak_minutes: float = 120.0
 
 
 _PYTEST_FIGURE: Final = r"\d+ (passed|failed)\b[^\n]*?(?= in [\d.]+)"
