@@ -57,7 +57,7 @@ ROUNDS = 2
 WATCHED_S = 0.25
 """Between two queries of all clients together."""
 PEER_FIGURES = "waiting 0.3 %, printing 0.8 % of a core, 34 MB resident"
-"""One node, the same file; measured beside e013306 of this project (2 %, 2.7 %, 59 MB) on another computer."""
+"""One node, the same file; measured on another computer beside e013306, which took 2 %, 2.7 %, 59 MB."""
 CARD = "\n[virtual_sdcard]\npath: {folder}\n[pause_resume]\n"
 
 
@@ -385,7 +385,7 @@ def main() -> None:
     if 3 in chosen.nodes:
         play(THREE_NODES, "canductor, three nodes (two on CAN, one on a UART):", ours, chosen)
     if chosen.peer is None:
-        print(f"the peer, on another computer: {PEER_FIGURES}; to measure it here, name its klippy.py with --peer")
+        print(f"the peer, on another computer: {PEER_FIGURES}; to measure it here: --peer KLIPPY.PY")
         return
 
     def peer_command(config: Path, api: Path) -> list[str]:
