@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from coordinator.cli.parser import Job, build_parser, parse_command_line
 from coordinator.support.interrupts import Terminated
 from coordinator.support.report import Report
-from coordinator.support.version import version
+from coordinator.support.version import VERSION
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import ParserExit, UsageError
 from nodes.support.terminal import show, show_error
@@ -110,7 +110,7 @@ def _report_bug(as_json: bool) -> int:
     with tempfile.NamedTemporaryFile(
         "w", prefix="canductor-", suffix=".log", delete=False, encoding="utf-8"
     ) as log:
-        log.write(f"canductor {version()}, Python {sys.version}\n{' '.join(sys.argv)}\n\n")
+        log.write(f"canductor {VERSION}, Python {sys.version}\n{' '.join(sys.argv)}\n\n")
         log.write(traceback.format_exc())
     sentence = f"internal error: {type(error).__name__}: {error}; please report it with {log.name}"
     return _fail(" ".join(sentence.split()), EXIT_BUG, as_json)

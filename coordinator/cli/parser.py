@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any, Final, cast
 
 from coordinator.support.report import Report
-from coordinator.support.version import version
+from coordinator.support.version import VERSION
 from nodes.support.option_values import Parser, UsageError
 
 Job = Callable[[], Report]
@@ -37,7 +37,7 @@ def build_parser(command: str = "") -> Parser:
         description="One coordinator conducts many micro-controllers on CAN buses and UARTs as one machine.",
     )
     parser.add_argument(
-        "--version", action="version", version=f"canductor {version()}", help="print the version"
+        "--version", action="version", version=f"canductor {VERSION}", help="print the version"
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     modules = COMMANDS.values() if command == "" else (COMMANDS[command],)

@@ -19,7 +19,7 @@ from typing import Final
 from coordinator.service.core.machine_service import MachineService, ServiceState
 from coordinator.service.state.log_ring import Entry
 from coordinator.support.values import Value
-from coordinator.support.version import version
+from coordinator.support.version import VERSION
 from nodes.support.terminal import printable
 
 FILE_BYTES_MAX: Final = 10_485_760
@@ -175,7 +175,7 @@ def _now() -> str:
 def _banner(config: Path) -> str:
     return "\n".join(
         (
-            f"======== canductor {version()}, {_now()}",
+            f"======== canductor {VERSION}, {_now()}",
             f"configuration file: {config.absolute()}",
             f"Python {platform.python_version()}, {platform.platform()}, {os.cpu_count() or 1} processors",
             f"process {os.getpid()} of user {os.getuid()}: {' '.join(sys.argv)}".replace("\n", " "),

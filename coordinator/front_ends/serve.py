@@ -34,7 +34,7 @@ from coordinator.support.interrupts import run_to_end
 from coordinator.support.loop_watchdog import WatchedLoop
 from coordinator.support.report import PlainReport, Report
 from coordinator.support.values import Value
-from coordinator.support.version import version
+from coordinator.support.version import VERSION
 from coordinator.tables.store import table_folder
 from coordinator.web.access import LINK_S
 from coordinator.web.settings import WebSettings
@@ -257,7 +257,7 @@ class _ServiceProcess:
 
         from coordinator.front_ends.http_servers import make_metrics  # noqa: PLC0415 (see there)
 
-        about = {"name": self._options.name, "version": version(), "api": str(API_VERSION)}
+        about = {"name": self._options.name, "version": VERSION, "api": str(API_VERSION)}
         metrics = make_metrics(fields, about, self._options.metrics, is_open=self._options.metrics_open)
         await metrics.start()
         stack.push_async_callback(metrics.close)
@@ -274,7 +274,7 @@ class _ServiceProcess:
         machine = Announcement(
             name=service.settings.name,
             host=host_word(platform.node()),
-            version=version(),
+            version=VERSION,
             state=str(service.state),
             api=API_VERSION,
             tls=self._options.certificate is not None and self._options.private_key is not None,

@@ -25,7 +25,7 @@ from coordinator.modules.homing.homing import Homing
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.work import LINES_MAX
-from coordinator.support.version import version
+from coordinator.support.version import VERSION
 from nodes.support.errors import CanductorError
 
 Result = Mapping[str, Any]
@@ -65,7 +65,7 @@ class Endpoints:
             "group_id": os.getgid(),
             "log_file": "" if log_file is None else str(log_file.absolute()),
             "config_file": str(config.absolute()),
-            "software_version": f"{APP}-{version()}",
+            "software_version": f"{APP}-{VERSION}",
             "cpu_info": f"{os.cpu_count() or 1} core {platform.machine()}",
             "app": APP,
         }

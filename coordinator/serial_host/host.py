@@ -12,7 +12,7 @@ from coordinator.klippy_api.status import state_of
 from coordinator.serial_host.protocol import BUSY, HostLine, SerialProtocol
 from coordinator.service.core.machine_service import MachineService, ServiceState
 from coordinator.service.state.log_ring import Entry
-from coordinator.support.version import version
+from coordinator.support.version import VERSION
 from nodes.support.errors import CanductorError
 
 WHO: Final = "M112 of the serial host"
@@ -28,7 +28,7 @@ _WITH_OK: Final[Mapping[str, re.Pattern[str]]] = {
 """Commands whose reply stands on the line of ``ok``, and how that begins."""
 _NO_MACHINE: Final[Mapping[str, str]] = {
     "M105": "T:0",
-    "M115": f"FIRMWARE_NAME:canductor FIRMWARE_VERSION:{version()}",
+    "M115": f"FIRMWARE_NAME:canductor FIRMWARE_VERSION:{VERSION}",
 }
 """What they answer while there is no machine: hosts look by them whether anybody is there."""
 

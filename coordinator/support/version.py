@@ -1,11 +1,6 @@
-"""The version of the installed project."""
+"""The project's version, which packaging reads here, too."""
 
-from importlib import metadata
+from typing import Final
 
-
-def version() -> str:
-    """Return the version, such as 1.2.3, or "(not installed)"."""
-    try:
-        return metadata.version("canductor")
-    except metadata.PackageNotFoundError:
-        return "(not installed)"
+VERSION: Final = "0.1.0"
+"""As semver.org numbers them."""

@@ -1,12 +1,12 @@
 """Commands for people at a console: HELP, STATUS, M115."""
 
-from importlib.metadata import version
 from typing import Final
 
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.print_stats import PrintStats
+from coordinator.support.version import VERSION
 
 NAME: Final = "canductor"
 
@@ -45,4 +45,4 @@ class Console(Module):
         return Immediate((f"{stats.state} {stats.job['filename']}",))
 
     def _identify(self, _call: Call) -> Reading:
-        return Immediate((f"FIRMWARE_NAME:{NAME} FIRMWARE_VERSION:{version(NAME)}",), kind=ReplyKind.PLAIN)
+        return Immediate((f"FIRMWARE_NAME:{NAME} FIRMWARE_VERSION:{VERSION}",), kind=ReplyKind.PLAIN)

@@ -13,7 +13,7 @@ from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Scope,
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.state.log_ring import KEEP
 from coordinator.support.values import Value
-from coordinator.support.version import version
+from coordinator.support.version import VERSION
 
 _CAUSE_MAX: Final = 200
 _STATES: Final = (
@@ -25,14 +25,13 @@ _STATES: Final = (
 def machine_methods(service: MachineService) -> Iterator[Method]:
     """Return them."""
     started_s = time.time()
-    version_text = version()  # reads package data: once
 
     def info(_caller: Caller, _params: dict[str, Any]) -> Value:
         described = None if service.machine is None else service.machine.description
         return {
             "name": service.settings.name,
             "id": service.settings.id,
-            "version": version_text,
+            "version": VERSION,
             "host": platform.node(),
             "started_s": round(started_s, 3),
             "starts": service.starts,
