@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
+#include "coordinator/motion/growing_ring.h"
 #include "coordinator/motion/planner/planner_internal.h"
 #include <math.h>
+#include <stddef.h>
 #include <string.h>
 
 // Flanks of the smooth profile are equal but for rounding; less than this is neither rise nor fall.
@@ -13,7 +15,7 @@ enum { PLAN_AFTER_MIN = 32 };
 static const double PLAN_AFTER_S = 0.25;
 
 static inline struct planned_move *move_at(struct planner *p, uint64_t index) {
-    return &p->queue[index & (PLANNER_QUEUE - 1)];
+    return &p->queue[index & (p->queue_room - 1)];
 }
 
 static inline int ring_is_full(const struct planner *p) {
@@ -30,7 +32,8 @@ static void stand_still(struct planner *p) {
 }
 
 void planner_init(struct planner *p, const struct planner_limits *limits, const double position[4]) {
-    memset(p, 0, sizeof *p);
+    memset(p, 0, offsetof(struct planner, queue));
+    p->queue_room = p->ring_room = RING_FIRST_ROOM;
     p->limits = *limits;
     p->accel = p->travel_accel = limits->max_accel;
     memcpy(p->position, position, sizeof p->position);
@@ -78,6 +81,7 @@ static void bound_start(struct planned_move *move, const struct planned_move *be
 int planner_add(struct planner *p, const double target[4], double speed) {
     if (p->tail - p->head == PLANNER_QUEUE)
         return planner_refuse(p, PLANNER_NO_FAULT, 0, 0, 0, 0);
+    ring_make_room(p->queue, sizeof *p->queue, p->head, p->tail, &p->queue_room, PLANNER_QUEUE);
     struct planned_move *move = move_at(p, p->tail);
     int what = planner_describe(p, move, target, speed);
     if (what <= 0) {
@@ -181,7 +185,8 @@ static void climb_hill(struct planner *p) {
 }
 
 static void hand_out(struct planner *p, const struct planned_move *move, double end_v2, double cruise_v2) {
-    struct trapezoid *out = &p->ring[p->ring_tail++ & (PLANNER_RING - 1)];
+    ring_make_room(p->ring, sizeof *p->ring, p->ring_head, p->ring_tail, &p->ring_room, PLANNER_RING);
+    struct trapezoid *out = &p->ring[p->ring_tail++ & (p->ring_room - 1)];
     double start_v2 = p->speed_v2, accel = move->accel;
     double triangle_v2 = 0.5 * (start_v2 + end_v2 + move->reach_v2);
     double end = sqrt(end_v2);
@@ -300,9 +305,9 @@ int planner_set_position(struct planner *p, const double position[4]) {
 }
 
 const struct trapezoid *planner_peek(const struct planner *p, uint32_t *count) {
-    uint32_t first = (uint32_t)p->ring_head & (PLANNER_RING - 1);
+    uint32_t first = (uint32_t)p->ring_head & (p->ring_room - 1);
     uint32_t all = (uint32_t)(p->ring_tail - p->ring_head);
-    *count = all < PLANNER_RING - first ? all : PLANNER_RING - first;
+    *count = all < p->ring_room - first ? all : p->ring_room - first;
     return &p->ring[first];
 }
 

@@ -118,6 +118,7 @@ struct planner {
     int32_t hill_closed, falling;
 
     uint64_t ring_head, ring_tail;
+    uint32_t queue_room, ring_room; // in use; see growing_ring.h
     struct planned_move queue[PLANNER_QUEUE];
     struct trapezoid ring[PLANNER_RING];
 };
@@ -149,7 +150,8 @@ int planner_begin_at(struct planner *p, double print_time);
 // The machine stands at POSITION from now on. Only after a complete flush; returns -1 otherwise.
 int planner_set_position(struct planner *p, const double position[4]);
 
-// The oldest trapezoids, *count of them in one piece; more may follow after planner_release.
+// The oldest trapezoids, *count of them in one piece; more may follow after planner_release. They are void
+// once a move is added or planned.
 const struct trapezoid *planner_peek(const struct planner *p, uint32_t *count);
 // Gives back the oldest COUNT; returns -1 when there are not so many.
 int planner_release(struct planner *p, uint32_t count);

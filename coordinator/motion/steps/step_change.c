@@ -104,7 +104,7 @@ static int set_motor_position(struct step_gen *gen, const double *position) {
     // Moves that still act are shifted, as if they had led here.
     for (uint64_t i = gen->kept_from; i < gen->moves_to; i++)
         for (int j = 0; j < AXES; j++)
-            gen->moves[i % STEP_TRAPEZOIDS].start[j] += shift[j];
+            step_move(gen, i)->start[j] += shift[j];
     for (int j = 0; j < AXES; j++)
         gen->rest[j] += shift[j];
     return STEP_OK;

@@ -3,6 +3,7 @@
 #ifndef MOTION_STEP_INTERNAL_H
 #define MOTION_STEP_INTERNAL_H
 
+#include "coordinator/motion/growing_ring.h"
 #include "coordinator/motion/steps/steps.h"
 #include "coordinator/motion/steps/times/step_formula.h"
 #include "coordinator/motion/steps/times/step_surface.h"
@@ -95,7 +96,8 @@ struct stepper {
     int64_t pulse_ticks, lead_ticks, reset_margin_ticks;
 
     struct segment *segments; // ring
-    uint32_t segment_head, segment_count;
+    uint64_t segments_from, segments_to;
+    uint32_t segment_room; // see growing_ring.h
     struct prefix queue_step, set_dir, reset_clock;
     struct step_stepper_stats stats;
 };
@@ -174,6 +176,7 @@ struct step_gen {
     struct stepper *steppers;
     struct node *nodes;
     struct trapezoid *moves;                  // ring
+    uint32_t move_room;                       // see growing_ring.h
     uint64_t kept_from, moves_from, moves_to; // kept, not yet generated, end
     double rest[AXES];                        // mm, where the axes stand before the first kept move
     struct axis_table tables[3];              // X Y Z; kept moves and REST include what they add
@@ -191,8 +194,12 @@ struct step_gen {
     struct step_error error;
 };
 
-static inline const struct trapezoid *step_move(const struct step_gen *gen, uint64_t number) {
-    return &gen->moves[number % STEP_TRAPEZOIDS];
+static inline struct trapezoid *step_move(const struct step_gen *gen, uint64_t number) {
+    return &gen->moves[number & (gen->move_room - 1)];
+}
+
+static inline struct segment *step_segment(const struct stepper *s, uint64_t number) {
+    return &s->segments[number & (s->segment_room - 1)];
 }
 
 static inline double move_end(const struct trapezoid *m) {

@@ -91,7 +91,7 @@ static void advance_req(struct node *node, uint64_t req) {
 }
 
 static void emit_segment(struct node *node, struct stepper *s) {
-    const struct segment *g = &s->segments[s->segment_head];
+    const struct segment *g = step_segment(s, s->segments_from);
     advance_req(node, positive(g->req));
     if (g->flags & SEGMENT_RESET)
         emit_for(node, s, positive(g->reset_min), &s->reset_clock, &g->reset_clock, 1);
@@ -104,8 +104,7 @@ static void emit_segment(struct node *node, struct stepper *s) {
     emit_for(node, s, min_clock, &s->queue_step, values, 3);
     s->stats.issued += g->flags & SEGMENT_BACK ? -(int64_t)g->count : g->count;
     s->stats.issued_clock = g->finish;
-    s->segment_head = (s->segment_head + 1) % STEP_SEGMENTS;
-    s->segment_count--;
+    s->segments_from++;
 }
 
 // ------------------------------------------------------------------------------------------------- merge
@@ -140,9 +139,10 @@ static size_t merge_node(struct step_gen *gen, struct node *node, bool flush) {
         struct stepper *first = NULL;
         int64_t req = steps_until;
         for (size_t i = 0; i < count; i++)
-            if (mine[i]->segment_count && mine[i]->segments[mine[i]->segment_head].req < req) {
+            if (mine[i]->segments_from < mine[i]->segments_to &&
+                step_segment(mine[i], mine[i]->segments_from)->req < req) {
                 first = mine[i];
-                req = first->segments[first->segment_head].req;
+                req = step_segment(first, first->segments_from)->req;
             }
         if (!first)
             return moved;

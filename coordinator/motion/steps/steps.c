@@ -51,7 +51,8 @@ static void carve_stepper(struct arena *arena, struct stepper *s) {
     double *high = piece(arena, STEP_BUFFER + BUFFER_PAD, sizeof(double));
     struct segment *segments = piece(arena, STEP_SEGMENTS, sizeof(struct segment));
     if (s)
-        s->ticks = ticks, s->low = low, s->high = high, s->segments = segments;
+        s->ticks = ticks, s->low = low, s->high = high, s->segments = segments,
+        s->segment_room = RING_FIRST_ROOM;
 }
 
 static void carve_node(struct arena *arena, struct node *node, size_t slots) {
@@ -74,6 +75,7 @@ static struct step_gen *carve(struct arena *arena, const struct step_config *c) 
     if (gen) {
         memset(gen, 0, (size_t)((uint8_t *)moves - (uint8_t *)gen));
         gen->steppers = steppers, gen->nodes = nodes, gen->moves = moves;
+        gen->move_room = RING_FIRST_ROOM;
         for (size_t i = 0; i < 3; i++)
             gen->table_values[i] = tables + i * 3 * STEP_TABLE_POINTS;
     }
@@ -163,7 +165,9 @@ static bool move_is_legal(struct trapezoid *m) {
 
 static void keep(void *context, const struct trapezoid *move) {
     struct step_gen *gen = context;
-    gen->moves[gen->moves_to++ % STEP_TRAPEZOIDS] = *move;
+    ring_make_room(gen->moves, sizeof(*gen->moves), gen->kept_from, gen->moves_to, &gen->move_room,
+                   STEP_TRAPEZOIDS);
+    *step_move(gen, gen->moves_to++) = *move;
     gen->moves_end = move_end(move);
 }
 
@@ -236,12 +240,11 @@ static int advance(struct step_gen *gen, double force_s, bool flush) {
 
 static void finish_slice(struct step_gen *gen) {
     gen->until = gen->slice;
-    while (gen->moves_from < gen->moves_to &&
-           is_over(move_end(&gen->moves[gen->moves_from % STEP_TRAPEZOIDS]), gen->until))
+    while (gen->moves_from < gen->moves_to && is_over(move_end(step_move(gen, gen->moves_from)), gen->until))
         gen->moves_from++;
     const double past = gen->until - step_look_ahead(gen) - step_lag(gen) - ROUNDING_S;
     for (; gen->kept_from < gen->moves_from; gen->kept_from++) {
-        const struct trapezoid *m = &gen->moves[gen->kept_from % STEP_TRAPEZOIDS];
+        const struct trapezoid *m = step_move(gen, gen->kept_from);
         if (move_end(m) > past && step_look_ahead(gen) + step_lag(gen) > 0)
             break;
         step_move_end_position(m, gen->rest);
@@ -288,7 +291,7 @@ static double next_slice(const struct step_gen *gen, double until) {
     if (gen->moves_from == gen->moves_to)
         end = until;
     else
-        end = fmax(end, gen->moves[gen->moves_from % STEP_TRAPEZOIDS].print_time);
+        end = fmax(end, step_move(gen, gen->moves_from)->print_time);
     return fmax(fmin(end, until), gen->until);
 }
 

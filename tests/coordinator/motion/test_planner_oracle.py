@@ -9,12 +9,13 @@ from hypothesis import strategies as st
 
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.specs import MotionLimits
-from coordinator.motion.trapezoid_array import array_of
 from tests.coordinator.motion.planner_helpers import (
     LIMITS,
     Array,
     check_invariants,
+    drain,
     end_speeds,
+    flushed,
     homed_planner,
     lengths,
     planned,
@@ -141,11 +142,7 @@ def test_real_files(name: str) -> None:
             planner.relative_extrusion = language.relative_e
             if line.startswith("G92"):
                 planner.set_gcode_position({"E": 0.0})
-        while (batch := planner.take()).count:
-            pieces.append(array_of(batch).copy())
-            planner.release(batch.count)
-    assert planner.flush()
-    pieces.append(array_of(planner.take()).copy())
-    t = np.concatenate(pieces)
+        pieces += drain(planner)
+    t = np.concatenate(pieces + flushed(planner))
     compare(t, language)
     check_invariants(t, end=planner.toolhead_position)

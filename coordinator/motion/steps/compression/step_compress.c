@@ -281,7 +281,9 @@ static void send(struct stepper *s, size_t from, struct segment *g, int64_t cloc
     s->sent_direction = s->direction;
     s->sent_clock = g->finish;
     s->sent_ticks = s->ticks[from + fit->count - 1];
-    s->segments[(s->segment_head + s->segment_count++) % STEP_SEGMENTS] = *g;
+    ring_make_room(s->segments, sizeof(*s->segments), s->segments_from, s->segments_to, &s->segment_room,
+                   STEP_SEGMENTS);
+    *step_segment(s, s->segments_to++) = *g;
 }
 
 static void drop_sent(struct stepper *s, size_t sent) {
@@ -300,7 +302,7 @@ static int send_way(struct step_gen *gen, struct search *q, int depth, struct se
     for (int level = depth; level > 0; level--)
         chosen[level - 1] = q->ways[level][chosen[level]].from;
     for (int level = 1; level <= depth; level++) {
-        if (s->segment_count == STEP_SEGMENTS)
+        if (s->segments_to - s->segments_from == STEP_SEGMENTS)
             return STEP_STALLED;
         const struct way *way = &q->ways[level][chosen[level]];
         const int64_t clock = (int64_t)q->ways[level - 1][chosen[level - 1]].clock;

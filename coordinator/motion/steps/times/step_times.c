@@ -220,7 +220,7 @@ static int check_begin(struct step_gen *gen, const struct stepper *s, const stru
 
 int step_times_advance(struct step_gen *gen, struct stepper *s, double until) {
     for (; s->move < gen->moves_to; s->move++) {
-        const struct trapezoid *m = &gen->moves[s->move % STEP_TRAPEZOIDS];
+        const struct trapezoid *m = step_move(gen, s->move);
         if (m->print_time >= until && !is_over(move_end(m), until))
             break;
         int status = STEP_OK;
