@@ -51,16 +51,12 @@ class Device(Protocol):
 class Module:
     """One section of the configuration."""
 
-    KIND: ClassVar[str] = ""
-    """The first word of its sections; empty: it has none, or its package declares it as an entry point."""
     SPEC: ClassVar[SectionSpec] = SectionSpec(help="", options=())
     """All its options; the reference page is made from it. Modules without a section have none."""
     NAMED: ClassVar[bool] = False
     """Whether there may be several, ``[kind NAME]``; else there is one, ``[kind]``."""
     NAMELESS: ClassVar[bool] = False
     """Whether, where there may be several, one may be without a name."""
-    READS: ClassVar[str] = ""
-    """A pattern of section names: it reads further options of sections that the machine itself reads."""
     SHOWN_AS: ClassVar[str] = ""
     """Under which name macros and front ends see its status; empty: under that of its section."""
     TITLE: ClassVar[str] = ""

@@ -122,7 +122,6 @@ class Compensation:
 class AxisTwistCompensation(Module):
     """The compensation of both axes, and its command."""
 
-    KIND = "axis_twist_compensation"
     SPEC: ClassVar = SectionSpec(
         "Corrects heights that the probe finds along an axis that is twisted",
         (TRAVEL_SPEED, HEIGHT, *AXES["X"].all, *AXES["Y"].all),

@@ -50,7 +50,6 @@ RESTORE: Final = "_BED_MESH_RESTORE"
 class BedMeshSection(Module):
     """The plain section has the settings, a named one is a profile."""
 
-    KIND = "bed_mesh"
     SPEC = SectionSpec(
         "Z follows the shape of the bed; [bed_mesh NAME] is a profile that was saved",
         (*SETTINGS, *PROFILE),

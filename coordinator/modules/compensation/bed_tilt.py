@@ -85,7 +85,6 @@ class Tilt:
 class BedTilt(Module):
     """The section."""
 
-    KIND = "bed_tilt"
     SPEC = SectionSpec("Z follows a tilted bed", (X_ADJUST, Y_ADJUST, Z_ADJUST, POINTS, *OPTIONS))
 
     def __init__(self, build: Build) -> None:

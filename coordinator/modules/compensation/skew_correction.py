@@ -78,7 +78,6 @@ class Skew:
 class SkewCorrection(Module):
     """A profile; the plain section has none."""
 
-    KIND = "skew_correction"
     SPEC = SectionSpec(
         "Axes that are not at right angles; [skew_correction NAME] is a profile", tuple(OPTIONS.values())
     )

@@ -66,7 +66,6 @@ MOST: Final = FloatOption(
 class ZThermalAdjust(TemperatureSensor):
     """The section."""
 
-    KIND = "z_thermal_adjust"
     NAMED: ClassVar = False
     SPEC: ClassVar = SectionSpec(
         help="Corrects Z for a frame that grows with its temperature",

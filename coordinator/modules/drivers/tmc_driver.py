@@ -271,7 +271,6 @@ class DriverFaultError(CanductorError):
 class Tmc2209(TmcDriver):
     """A TMC2209."""
 
-    KIND = "tmc2209"
     CHIP = TMC2209
     SPEC = driver_spec(TMC2209)
 
@@ -279,7 +278,6 @@ class Tmc2209(TmcDriver):
 class Tmc2208(TmcDriver):
     """A TMC2208, and its like of the same registers: TMC2225."""
 
-    KIND = "tmc2208"
     CHIP = TMC2208
     SPEC = driver_spec(TMC2208)
 

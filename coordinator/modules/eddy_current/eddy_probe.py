@@ -15,7 +15,7 @@ from coordinator.config.errors import ConfigError
 from coordinator.config.options import ChoiceOption, FloatOption, IntOption, Option, SectionSpec, TextOption
 from coordinator.config.pins import PinOption
 from coordinator.config.sections.bounds import MAX_POSITION
-from coordinator.config.sections.probe import DESCEND_Z, EDDY, I2C_MCU, Z_OFFSET
+from coordinator.config.sections.probe import DESCEND_Z, I2C_MCU, Z_OFFSET
 from coordinator.gcode.builtins.state import go
 from coordinator.gcode.commands import (
     AtStandstill,
@@ -129,7 +129,6 @@ class Compensation(Protocol):
 class EddyProbe(Probe):
     """The probe of [probe_eddy_current NAME]; for homing moves also the sensor in the place of an endstop."""
 
-    KIND = EDDY
     NAMED = True
     TITLE = "[probe_eddy_current NAME]"
     SPEC = SectionSpec(

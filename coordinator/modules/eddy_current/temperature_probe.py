@@ -60,7 +60,6 @@ LOWEST: Final = FloatOption(
 class TemperatureProbe(TemperatureSensor):
     """The section."""
 
-    KIND = "temperature_probe"
     SPEC: ClassVar = SectionSpec(
         help="The temperature of the coil of [probe_eddy_current NAME], which corrects its drift",
         options=(

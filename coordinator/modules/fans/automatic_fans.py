@@ -79,7 +79,6 @@ class _HeaterNames:
 class HeaterFan(FanModule):
     """A fan that runs while a heater is hot."""
 
-    KIND = "heater_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that runs while a heater is hot or has a target, such as that of a hot end",
@@ -117,7 +116,6 @@ class HeaterFan(FanModule):
 class ControllerFan(FanModule):
     """A fan that cools a board while its motors or heaters are on."""
 
-    KIND = "controller_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that runs while steppers are on or a heater has a target, and some time after; steppers"

@@ -23,7 +23,6 @@ FULL: Final = 255.0
 class Fan(FanModule):
     """The fan that cools the part."""
 
-    KIND = "fan"
     SPEC: ClassVar = SectionSpec(
         help="The fan that cools the part: M106, M107",
         options=fan_options(OFF),
@@ -76,7 +75,6 @@ class GenericFans(Module):
 class FanGeneric(FanModule):
     """A fan that programs set by its name."""
 
-    KIND = "fan_generic"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that programs set: SET_FAN_SPEED FAN=NAME SPEED=",

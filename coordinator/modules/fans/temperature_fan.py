@@ -94,7 +94,6 @@ class TemperatureFans(Module):
 class TemperatureFan(FanModule):
     """A fan that holds a temperature down."""
 
-    KIND = "temperature_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that keeps a temperature down, such as that of a board or a chamber",

@@ -191,7 +191,6 @@ def _texts(gains: PidGains) -> dict[str, str]:
 class PidProfile(Module):
     """One profile of one heater."""
 
-    KIND = "pid_profile"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="PID constants of a heater for other circumstances: [pid_profile HEATER NAME], and PID_PROFILE"

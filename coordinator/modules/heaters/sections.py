@@ -53,7 +53,6 @@ class HeaterSection(Module):
 class HeaterBed(HeaterSection):
     """The heater of the bed."""
 
-    KIND = "heater_bed"
     SPEC: ClassVar = SectionSpec(
         help="The heated bed", options=HEATER_OPTIONS, unsupported=UNSUPPORTED_HEATER_OPTIONS
     )
@@ -73,7 +72,6 @@ class HeaterBed(HeaterSection):
 class HeaterGeneric(HeaterSection):
     """A heater of any kind."""
 
-    KIND = "heater_generic"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A heater for anything else; programs call it by NAME",
@@ -122,7 +120,6 @@ class ExtruderHeaterCommands(Module):
 class ExtruderHeaterSection(Module):
     """The heater of an extruder; an extruder without heater_pin has none."""
 
-    READS = r"extruder[0-9]*"
     TITLE: ClassVar = "[extruder], [extruder1] …"
     SPEC: ClassVar = SectionSpec(
         help="The heater of an extruder",

@@ -46,7 +46,6 @@ HEATING_GAIN: Final = FloatOption(
 class VerifyHeater(Module):
     """The limits of the heater that the section is named after."""
 
-    KIND = "verify_heater"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="Limits of the check that a heater (extruder, heater_bed or the name of a heater_generic) heats;"

@@ -134,7 +134,6 @@ class EndstopPhases(Module):
 class EndstopPhase(Module):
     """A section: with a name it corrects the endstop of that stepper, without one it brings the command."""
 
-    KIND = "endstop_phase"
     NAMED: ClassVar = True
     NAMELESS: ClassVar = True
     SPEC: ClassVar = SectionSpec(

@@ -35,7 +35,6 @@ _LINES: Final = "_HOMING_OVERRIDE_LINES"
 class HomingOverride(Module):
     """The lines that replace G28."""
 
-    KIND = "homing_override"
     SPEC = SectionSpec("G28 is replaced by these lines of g-code", (GCODE, AXES, *SET))
 
     def __init__(self, build: Build) -> None:

@@ -60,7 +60,6 @@ BACK: Final = BoolOption(
 class SafeZHome(Module):
     """Replaces G28."""
 
-    KIND = "safe_z_home"
     SPEC = SectionSpec(
         "G28 homes Z at one position of the bed, after X and Y",
         (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK),

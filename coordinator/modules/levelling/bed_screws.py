@@ -43,7 +43,6 @@ _OPTIONS: Final[tuple[Option[Any], ...]] = (TRAVEL_SPEED, HEIGHT, PROBE_HEIGHT, 
 class BedScrews(Module):
     """The section."""
 
-    KIND = "bed_screws"
     SPEC = SectionSpec("Moves to each screw of the bed while it is adjusted by hand", _OPTIONS, family=SCREW)
 
     def __init__(self, build: Build) -> None:

@@ -82,7 +82,6 @@ class _Known:
 class DeltaCalibrate(Module):
     """The section."""
 
-    KIND = "delta_calibrate"
     SPEC = SectionSpec("Finds endstops, tower angles, radius and rods of a delta", _OPTIONS, family=DISTANCE)
 
     def __init__(self, build: Build) -> None:

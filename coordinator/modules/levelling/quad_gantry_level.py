@@ -37,7 +37,6 @@ MOTORS: Final = 4
 class QuadGantryLevel(MotorLevelling):
     """The section."""
 
-    KIND = "quad_gantry_level"
     SPEC = SectionSpec(
         "Levels a gantry by the four motors of Z at its corners",
         (CORNERS, POINTS, MAX_ADJUST, *OPTIONS),

@@ -27,7 +27,6 @@ _OPTIONS: Final[tuple[Option[Any], ...]] = (THREAD, *OPTIONS)
 class ScrewsTiltAdjust(Module):
     """The section."""
 
-    KIND = "screws_tilt_adjust"
     SPEC = SectionSpec("Measures how far each screw of the bed has to be turned", _OPTIONS, family=SCREW)
 
     def __init__(self, build: Build) -> None:

@@ -22,7 +22,6 @@ POINTS: Final = PlacesOption(name="points", help="where the nozzle is when the b
 class ZTilt(MotorLevelling):
     """The section."""
 
-    KIND = "z_tilt"
     SPEC = SectionSpec(
         "Levels by the motors of Z, of which each carries a corner or a side",
         (POSITIONS, POINTS, *OPTIONS),

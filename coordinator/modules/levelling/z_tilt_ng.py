@@ -92,7 +92,6 @@ class _Runs:
 class ZTiltNg(MotorLevelling):
     """The section."""
 
-    KIND = "z_tilt_ng"
     SPEC = SectionSpec(
         "Levels by the motors of Z, and finds where they are",
         (POSITIONS, POINTS, OFFSETS, EXTRA, AVERAGING, DELTA, *OPTIONS),

@@ -34,7 +34,6 @@ _BEGUN: Final = (
 class LoadCellModule(Module):
     """The section."""
 
-    KIND = "load_cell"
     NAMED = True
     NAMELESS = True
     SPEC = SectionSpec("A scale: a load cell with an HX711 or HX717", CELL_OPTIONS, unsupported=UNSUPPORTED)

@@ -133,7 +133,6 @@ OPTIONS: Final[tuple[Option[Any], ...]] = (
 class LoadCellProbe(Probe):
     """The probe of [load_cell_probe]; for homing moves also the sensor in the place of an endstop."""
 
-    KIND = LOAD_CELL
     SPEC = SectionSpec(
         "The nozzle as probe, by the force of its touch: a load cell with an HX711 or HX717",
         OPTIONS,

@@ -51,7 +51,6 @@ class _Settings:
 class FirmwareRetraction(Module):
     """The commands; G11 undoes what G10 did, also when settings changed meanwhile."""
 
-    KIND = "firmware_retraction"
     SPEC = SectionSpec(
         "Retraction by G10 and G11",
         (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP),

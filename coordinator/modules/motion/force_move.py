@@ -29,7 +29,6 @@ _AXES: Final = "XYZ"
 class ForceMove(Module):
     """The commands."""
 
-    KIND = "force_move"
     SPEC = SectionSpec("Commands that move past all limits", (ENABLE,))
 
     def __init__(self, build: Build) -> None:

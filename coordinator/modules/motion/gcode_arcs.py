@@ -25,7 +25,6 @@ DEVIATION = FloatOption(
 class GCodeArcs(Module):
     """The precision, for the planner."""
 
-    KIND = "gcode_arcs"
     SPEC = SectionSpec("The precision of arcs (G2, G3)", (RESOLUTION, DEVIATION))
 
     def __init__(self, build: Build) -> None:

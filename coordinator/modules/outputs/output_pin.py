@@ -74,7 +74,6 @@ class OutputPins(Module):
 class OutputPin(Module):
     """An output that programs set."""
 
-    KIND = "output_pin"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="An output that programs set: SET_PIN PIN=NAME VALUE=",
@@ -178,7 +177,6 @@ class OutputPin(Module):
 class StaticDigitalOutput(Module):
     """Outputs that have one value."""
 
-    KIND = "static_digital_output"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(help="Outputs that are switched once, at the start", options=(PINS,))
 

@@ -89,7 +89,6 @@ OUTPUT_MODE: Final = ChoiceOption(
 class BLTouch(Probe):
     """The probe of [bltouch]."""
 
-    KIND = "bltouch"
     INPUT = SENSOR_PIN
     HAS_LINES: ClassVar = False
     SPEC = SectionSpec(

@@ -54,7 +54,6 @@ RECOVERY: Final = FloatOption(
 class SmartEffector(Probe):
     """The probe of [smart_effector]."""
 
-    KIND = "smart_effector"
     SPEC = SectionSpec(
         "The nozzle as probe, by strain gauges: the Smart Effector of Duet3D",
         (PIN, CONTROL_PIN, ACCEL, RECOVERY, *MEASURING_OPTIONS, *LINE_OPTIONS),

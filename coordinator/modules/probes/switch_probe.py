@@ -10,7 +10,6 @@ from coordinator.modules.probes.probe_commands import ProbeCommands
 class SwitchProbe(Probe):
     """The probe of [probe]."""
 
-    KIND = "probe"
     SPEC = SectionSpec(
         "A switch at the head that finds how high the bed is; by probe:z_virtual_endstop the endstop of Z",
         (PIN, *MEASURING_OPTIONS, *LINE_OPTIONS),

@@ -29,7 +29,6 @@ _COMMAND: Final = "_RUN_DELAYED_GCODE"
 class DelayedGCode(Module):
     """One section; a service runs its lines as those of a client."""
 
-    KIND = "delayed_gcode"
     SPEC = SectionSpec(
         "G-code that runs by itself after a delay", (GCODE, INITIAL), unsupported=("description",)
     )

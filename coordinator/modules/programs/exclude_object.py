@@ -35,7 +35,6 @@ class _Object:
 class ExcludeObject(Module):
     """The objects of the program that is being read."""
 
-    KIND = "exclude_object"
     SPEC = SectionSpec("Stop printing single objects of a job", (), unsupported=("enable_exclude_object",))
 
     def __init__(self, build: Build) -> None:

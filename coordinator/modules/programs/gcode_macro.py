@@ -94,7 +94,6 @@ class GCodeTemplate:
 class GCodeMacro(Module):
     """One macro."""
 
-    KIND = "gcode_macro"
     SPEC = SectionSpec(
         "A macro: the command NAME, in capitals, runs these lines of g-code",
         (GCODE, RENAME, DESCRIPTION),

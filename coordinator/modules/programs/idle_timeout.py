@@ -34,7 +34,6 @@ LOOK_S: Final = 1.0
 class IdleTimeout(Module):
     """Watches for idleness and acts."""
 
-    KIND = "idle_timeout"
     SPEC = SectionSpec("G-code to run when the machine is idle", (TIMEOUT, GCODE))
 
     def __init__(self, build: Build) -> None:

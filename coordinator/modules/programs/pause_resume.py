@@ -31,7 +31,6 @@ STATE: Final = "PAUSE_STATE"
 class PauseResume(Module):
     """The commands."""
 
-    KIND = "pause_resume"
     SPEC = SectionSpec("Pause and resume a job by g-code", (VELOCITY,))
 
     def __init__(self, build: Build) -> None:

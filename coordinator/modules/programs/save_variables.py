@@ -31,7 +31,6 @@ _HEADER: Final = "[Variables]"
 class SaveVariables(Module):
     """The values, and the file that has them."""
 
-    KIND = "save_variables"
     SPEC = SectionSpec("Variables that are kept in a file (SAVE_VARIABLE)", (FILENAME,))
 
     def __init__(self, build: Build) -> None:

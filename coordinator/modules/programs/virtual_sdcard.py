@@ -36,7 +36,6 @@ _BUSY: Final = "a job is active; wait for its end, or cancel it"
 class VirtualSdcard(Module):
     """Its commands; the service has the files."""
 
-    KIND = "virtual_sdcard"
     SPEC = SectionSpec("Files that are printed", (PATH, ON_ERROR), unsupported=("with_subdirs",))
 
     def __init__(self, build: Build) -> None:

@@ -54,7 +54,6 @@ _INSERT: Final = "_FILAMENT_INSERT"
 class FilamentSwitchSensor(Module):
     """One sensor."""
 
-    KIND = "filament_switch_sensor"
     SPEC = SectionSpec(
         "A switch that detects filament",
         (PIN, PAUSE, RUNOUT, INSERT, EVENT_DELAY),

@@ -23,7 +23,6 @@ _COMMAND: Final = "_BUTTON"
 class GCodeButton(Module):
     """One button; a service runs its lines as those of a client."""
 
-    KIND = "gcode_button"
     SPEC = SectionSpec("A button that runs g-code", (PIN, PRESS, RELEASE), unsupported=LATER)
     NAMED = True
 

@@ -27,7 +27,6 @@ GCODE_ID: Final = TextOption(
 class TemperatureSensor(SensorModule):
     """A sensor of no heater."""
 
-    KIND = "temperature_sensor"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A temperature that is reported; outside min_temp or max_temp its node stops the machine",

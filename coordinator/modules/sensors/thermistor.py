@@ -66,7 +66,6 @@ BETA: Final = FloatOption(
 class Thermistor(CustomSensor):
     """A thermistor by three points, or by one and beta."""
 
-    KIND = "thermistor"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A thermistor of your own, by three of its points (Steinhart-Hart) or by one and beta; sections"
@@ -99,7 +98,6 @@ ADC_POINTS: Final = tuple((_temperature(n), _volts(n), _ohms(n)) for n in range(
 class AdcTemperature(CustomSensor):
     """A sensor by its voltages or its resistances at some temperatures."""
 
-    KIND = "adc_temperature"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A sensor of your own, by its voltages or its resistances at 2 to 40 temperatures, with straight"

@@ -16,7 +16,6 @@ TEXT_MAX: Final = 500
 class DisplayStatus(Module):
     """A message, and the progress that the program reports."""
 
-    KIND = "display_status"
     SPEC = SectionSpec("The message (M117) and progress (M73) that programs set", ())
 
     def __init__(self, build: Build) -> None:

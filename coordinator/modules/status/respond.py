@@ -16,7 +16,6 @@ PREFIX = TextOption(name="default_prefix", help="Prefix of a line, instead of th
 class Respond(Module):
     """Its commands."""
 
-    KIND = "respond"
     SPEC = SectionSpec(
         "Lines that programs show to the user", (TYPE, PREFIX), unsupported=("enable_respond",)
     )
