@@ -80,8 +80,8 @@ def test_a_node_that_is_silent_for_a_moment_in_the_start(
 
 
 @pytest.mark.timeout(1800)  # of all seeds of profile ``full`` together
-@given(seed=integers(0, 2**32 - 1))
-@settings(max_examples=examples(1))
+@given(seed=integers(1, 2**32 - 1))  # 0, which would be the first, takes as long as 50 others
+@settings(max_examples=examples(4))
 def test_the_first_plain_restart_is_enough_when_all_is_sound_again(seed: int) -> None:
     """Whatever went wrong before it, also in other starts."""
     found = search(seed)
