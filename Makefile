@@ -8,8 +8,8 @@ NATIVE_INPUTS := $(C_SOURCES) $(wildcard firmware/Makefile firmware/tools/*.py) 
 
 C_WARNINGS := -std=gnu11 -Wall -Wextra -Wconversion -Wno-psabi -Werror -I. -Ifirmware
 
-.PHONY: demo test check pytest ctest fuzz vcan bench clean setup format pytest-live pytest-sim pytest-coordinator \
-	pytest-motion pytest-others
+.PHONY: demo test check pytest ctest fuzz vcan bench clean setup format pytest-live pytest-sim-a-m pytest-sim-n-z \
+	pytest-coordinator pytest-motion pytest-others
 .DEFAULT_GOAL := test
 
 # The C code is compiled while pip fetches packages.
@@ -61,12 +61,13 @@ ctest: $(VENV)/.installed
 LIVE := tests/smoke tests/coordinator/web
 MOTION := tests/coordinator/motion tests/coordinator/kinematics tests/coordinator/verification
 pytest-live: WHAT = $(LIVE)
-pytest-sim: WHAT = tests/sim
+pytest-sim-a-m: WHAT = $(sort $(wildcard tests/sim/test_[a-m]*.py))
+pytest-sim-n-z: WHAT = $(sort $(wildcard tests/sim/test_[n-z]*.py)) tests/sim/safety
 pytest-coordinator: WHAT = tests/coordinator $(addprefix --ignore=,$(LIVE) $(MOTION))
 pytest-motion: WHAT = $(MOTION)
 # The import floors are part of check.
 pytest-others: WHAT = tests $(addprefix --ignore=,$(LIVE) tests/sim tests/coordinator tests/test_import_floors.py)
-PARTS := pytest-live pytest-sim pytest-coordinator pytest-others pytest-motion
+PARTS := pytest-live pytest-sim-a-m pytest-sim-n-z pytest-coordinator pytest-others pytest-motion
 $(PARTS): $(VENV)/.installed
 	$(BIN)/pytest $(WHAT)
 
