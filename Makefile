@@ -62,7 +62,7 @@ LIVE := tests/smoke tests/coordinator/web
 MOTION := tests/coordinator/motion tests/coordinator/kinematics tests/coordinator/verification
 pytest-live: WHAT = $(LIVE)
 pytest-sim-a-m: WHAT = $(sort $(wildcard tests/sim/test_[a-m]*.py))
-pytest-sim-n-z: WHAT = $(sort $(wildcard tests/sim/test_[n-z]*.py)) tests/sim/safety
+pytest-sim-n-z: WHAT = $(sort $(wildcard tests/sim/test_[n-z]*.py))
 pytest-coordinator: WHAT = tests/coordinator $(addprefix --ignore=,$(LIVE) $(MOTION))
 pytest-motion: WHAT = $(MOTION)
 # The import floors are part of check.
