@@ -20,7 +20,7 @@ static inline void ring_make_room(void *ring, size_t size, uint64_t from, uint64
         return;
     uint8_t *at = ring;
     for (uint64_t i = from; i < to; i++) {
-        const size_t place = i & (*room - 1);
+        const size_t place = (size_t)(i & (*room - 1));
         if (i & *room) // of each two that share a place in turn, this one's new place is in the other half
             memcpy(at + (place + *room) * size, at + place * size, size);
     }
