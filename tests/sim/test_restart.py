@@ -20,7 +20,7 @@ from tests.stages.served import Served, running
 
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
 HEATED = Path("coordinator/simulate/machines/heated.cfg")
-HEATER, FAN, LAMP = "PA3", "PA8", "PA9"
+HEATER, FAN, LAMP, ENABLE = "PA3", "PA8", "PA9", "PA2"
 """Pins of its toolhead."""
 BOOTED_S = 3.5
 
@@ -284,19 +284,20 @@ def serve(machine: MachineStage, folder: Path, go: Callable[[Served], Awaitable[
 def test_outputs_of_nodes_that_keep_their_configuration_begin_again(
     tmp_path: Path, max_duration_s: float
 ) -> None:
-    """The heater's node shut down, as nobody renewed its power; fan and lamp remained as they were."""
-    machine = heated(tmp_path, f"max_duration: {max_duration_s}")
+    """The heater's node shut down, as nobody renewed its power; fan, lamp and motor remained as they were."""
+    machine = heated(tmp_path, f"enable_pin: !toolhead:{ENABLE}\nmax_duration: {max_duration_s}")
 
     async def go(stage: Served) -> None:
-        await run(stage, "G28\nG1 X20 F6000\nM104 S210\nM106 S255\nSET_PIN PIN=lamp VALUE=0")
+        await run(stage, "G28\nM83\nG1 X20 E1 F6000\nM104 S210\nM106 S255\nSET_PIN PIN=lamp VALUE=0")
         await asyncio.sleep(2.0)
-        assert machine.edges(LAMP, "toolhead")[-1][1] == 0
+        assert machine.edges(LAMP, "toolhead")[-1][1] == machine.edges(ENABLE, "toolhead")[-1][1] == 0
         assert machine.edges(HEATER, "toolhead")[-1][1] == machine.edges(FAN, "toolhead")[-1][1] == 1
         await run(stage, "RESTART")
         await begun_anew(stage, 2)
         await asyncio.sleep(0.3)
         assert machine.edges(HEATER, "toolhead")[-1][1] == 0
         assert machine.edges(FAN, "toolhead")[-1][1] == 0
+        assert machine.edges(ENABLE, "toolhead")[-1][1] == 1, "its motor is off"
         assert machine.edges(LAMP, "toolhead")[-1][1] == 1, "as at first"
         await asyncio.sleep(2 * max_duration_s)
         assert str(stage.service.state) == "ready"
