@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import re
 from collections.abc import Callable, Coroutine, Iterator, Mapping
 from typing import Any, Final
@@ -20,6 +21,8 @@ BUSY_S: Final = 2.0
 """A host that waits for a line hears that often that it is being done."""
 AHEAD_MAX: Final = 64
 """Moves that are acknowledged before they are read: the feeder takes what waits every 50 ms."""
+LINES_AT_ONCE: Final = 8
+"""Lines that are done in one turn of the loop; empty ones, say, wait for nothing by themselves."""
 _MOVES: Final = frozenset(("G0", "G1", "G2", "G3"))
 _WITH_OK: Final[Mapping[str, re.Pattern[str]]] = {
     "M105": re.compile(r"(?:T\d*|B|C):"),
@@ -107,7 +110,7 @@ class SerialHost:
     # ------------------------------------------------------------------------------------------- doing
 
     async def _work_off(self) -> None:
-        while True:
+        for count in itertools.count(1):
             self._line, self._with_ok = self.protocol.next_line(), ""
             self.on_room()
             if self._line is None:
@@ -122,7 +125,10 @@ class SerialHost:
                     await self._moved()
                     await self._shown(line.name, self._do(line))
             self.protocol.answer(self._with_ok)
+            self._line = None
             self._write()
+            if count % LINES_AT_ONCE == 0:
+                await asyncio.sleep(0)
 
     async def _shown(self, name: str, work: Coroutine[Any, Any, None]) -> None:
         """Have WORK done, and show why it fails."""

@@ -51,7 +51,7 @@ class SerialProtocol:
         self._rest = bytearray()
         self._too_long = False
         """Whether the line that has begun is refused already."""
-        self._waiting: deque[HostLine] = deque()
+        self._waiting: deque[bytes] = deque()
         self._waiting_bytes = 0
         self._last: int | None = None
         """Number of the last line that was taken; None: the next one may have any."""
@@ -67,25 +67,28 @@ class SerialProtocol:
         return self._waiting_bytes > WAITING_BYTES_MAX
 
     def receive(self, data: bytes) -> bool:
-        """Take DATA; return whether it stops the machine. Then the lines before the stop are forgotten."""
-        self._rest += data
-        *lines, rest = self._rest.split(b"\n")
-        self._rest = rest
-        stops = False
-        for line in lines:
-            if self._too_long:
-                self._too_long = False  # its end, which is refused with the rest of it
-                continue
-            if is_stop(bytes(line)):
-                stops = True
-                self._waiting.clear()
-                self._waiting_bytes = 0
-            self._add(self._read(bytes(line)))
+        """Take DATA; return whether it stops the machine. Then the lines before the stop are forgotten.
+
+        It takes no longer than it must, however many lines there are: they are read when they are next.
+        """
+        *lines, rest = (bytes(self._rest) + data).split(b"\n")
+        self._rest = bytearray(rest)
+        if lines and self._too_long:
+            self._too_long = False
+            del lines[0]  # its end, which is refused with the rest of it
+        stops = is_stop(b"\n".join(lines))
+        if stops:
+            del lines[: max(index for index, line in enumerate(lines) if is_stop(line))]
+            self._waiting.clear()
+            self._waiting_bytes = 0
+            self._last = None
         if len(self._rest) > LINE_BYTES_MAX:
             if not self._too_long:
-                self._add(_refused(line_of(ReplyKind.ERROR, f"a line has more than {LINE_BYTES_MAX} bytes")))
+                lines.append(rest)
             self._too_long = True
             self._rest.clear()
+        self._waiting.extend(lines)
+        self._waiting_bytes += sum(map(_cost, lines))
         return stops
 
     def stops_with(self, data: bytes) -> bool:
@@ -98,16 +101,12 @@ class SerialProtocol:
             return None
         line = self._waiting.popleft()
         self._waiting_bytes -= _cost(line)
-        return line
-
-    def _add(self, line: HostLine) -> None:
-        self._waiting.append(line)
-        self._waiting_bytes += _cost(line)
+        return self._read(line)
 
     def _read(self, line: bytes) -> HostLine:
-        line = line.strip(b" \t\r")
         if len(line) > LINE_BYTES_MAX:
             return _refused(line_of(ReplyKind.ERROR, f"a line has more than {LINE_BYTES_MAX} bytes"))
+        line = line.strip(b" \t\r")
         frame = _NUMBERED.match(line)
         return _host_line(line) if frame is None else self._read_numbered(line, int(frame[1]), frame.end())
 
@@ -179,5 +178,5 @@ def _refused(answer: str) -> HostLine:
     return HostLine("", "", answer)
 
 
-def _cost(line: HostLine) -> int:
-    return len(line.text) + LINE_COST_BYTES
+def _cost(line: bytes) -> int:
+    return len(line) + LINE_COST_BYTES

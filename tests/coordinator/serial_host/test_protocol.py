@@ -71,6 +71,14 @@ def test_a_stop_overtakes_what_waits(stop: bytes) -> None:
     assert lines(protocol) == [("", ""), ("M105", "M105")], "what came before it is forgotten"
 
 
+def test_after_a_stop_without_a_number_any_number_begins() -> None:
+    protocol = SerialProtocol()
+    protocol.receive(numbered(7, "G28"))
+    assert lines(protocol) == [("G28", "G28")]
+    assert protocol.receive(numbered(8, "G1 X1") + b"M112\n" + numbered(9, "M105"))
+    assert lines(protocol) == [("", ""), ("M105", "M105")]
+
+
 @pytest.mark.parametrize(
     "line", [b"M1120\n", b"M112.1\n", b"M117 M112\n", b";M112\n", b"ECHO M112\n", b"M11\n2\n"]
 )

@@ -5,6 +5,7 @@ import os
 import stat
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
 
@@ -13,7 +14,7 @@ import pytest
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.runtime.linux_host import LinuxHost
-from coordinator.serial_host.host import WHO
+from coordinator.serial_host.host import LINES_AT_ONCE, WHO
 from coordinator.serial_host.protocol import OUTPUT_BYTES_MAX
 from coordinator.serial_host.terminal import PseudoTerminal
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
@@ -114,6 +115,19 @@ def test_a_stop_is_found_while_the_loop_is_held(tmp_path: Path) -> None:
             lane.look()
             assert stops == [], "the loop has it"
         lane.look()
+
+    asyncio.run(main())
+
+
+def test_lines_that_wait_for_nothing_do_not_hold_the_loop(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with opened(tmp_path / "printer") as (terminal, _):
+            terminal.host.receive(b"\n; note\nM110\n" * 100)
+            waiting = [300]
+            while waiting[-1]:
+                await asyncio.sleep(0)
+                waiting.append(len(terminal.host.protocol._waiting))
+            assert max(before - after for before, after in pairwise(waiting)) == LINES_AT_ONCE
 
     asyncio.run(main())
 
