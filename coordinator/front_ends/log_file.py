@@ -7,29 +7,24 @@ left out and counted; the service never waits.
 import asyncio
 import os
 import platform
-import queue
 import sys
-import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from coordinator.front_ends.writing_thread import Text, WritingThread
 from coordinator.service.core.machine_service import MachineService, ServiceState
 from coordinator.service.state.log_ring import Entry
 from coordinator.support.values import Value
 from coordinator.support.version import VERSION
-from nodes.support.terminal import printable
 
 FILE_BYTES_MAX: Final = 10_485_760
 """A larger file is renamed to NAME.1, that to NAME.2, and so on."""
 KEPT: Final = 5
 """Older files."""
-WAITING_MAX: Final = 2_000
-"""Entries that wait to be written."""
 STATISTICS_S: Final = 30.0
-LINE_CHARS_MAX: Final = 8_000
 _SHOWN: Final = (
     "nodes.",
     "buses.",
@@ -53,9 +48,6 @@ _QUIET: Final = (
     ".uuid",
 )
 
-Text = Callable[[], str]
-"""Returns lines; called in the thread."""
-
 
 class LogFile:
     """Writes to PATH; ON_FAILURE gets a sentence, once for each time that the file could not be written."""
@@ -63,43 +55,25 @@ class LogFile:
     def __init__(self, path: Path, on_failure: Callable[[str], None]) -> None:
         self._path = path
         self._on_failure = on_failure
-        self._waiting: queue.Queue[Text | None] = queue.Queue(WAITING_MAX)
-        self._left_out = 0
         self._failed = False
-        self._thread = threading.Thread(target=self._run, name="log file", daemon=True)
-        self._thread.start()
+        self._thread = WritingThread("log file", self._try_to_write, "the disk is slow")
 
     def add(self, text: Text) -> None:
         """Have the lines written that TEXT returns; without effect when too many wait."""
-        try:
-            self._waiting.put_nowait(text)
-        except queue.Full:
-            self._left_out += 1
+        self._thread.add(text)
 
     def close(self) -> None:
         """Wait until all is written."""
-        self._waiting.put(None)
-        self._thread.join()
+        self._thread.close()
 
     # -------------------------------------------------------------------------------------- the thread
 
-    def _run(self) -> None:
-        ended = False
-        while not ended:
-            texts = [self._waiting.get()]
-            with suppress(queue.Empty):
-                while len(texts) < WAITING_MAX:
-                    texts.append(self._waiting.get_nowait())
-            ended = None in texts
-            lines = [line for text in texts if text is not None for line in text().split("\n")]
-            if left_out := self._left_out:
-                self._left_out -= left_out
-                lines.append(f"{left_out} entries were left out here: the disk is slow")
-            try:
-                self._write("".join(f"{printable(line)[:LINE_CHARS_MAX]}\n" for line in lines))
-                self._failed = False
-            except OSError as error:
-                self._fail(error)
+    def _try_to_write(self, text: str) -> None:
+        try:
+            self._write(text)
+            self._failed = False
+        except OSError as error:
+            self._fail(error)
 
     def _write(self, text: str) -> None:
         data = text.encode(errors="replace")

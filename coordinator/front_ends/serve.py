@@ -1,5 +1,6 @@
 """Serves a machine to front ends until Ctrl-C or SIGTERM: ``canductor run``, ``canductor demo --serve``."""
 
+import asyncio
 import contextlib
 import platform
 import sys
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
+from coordinator.front_ends.console import Console
 from coordinator.front_ends.log_file import ServiceLog
 from coordinator.front_ends.stop_path import StopPath
 from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
@@ -41,7 +43,6 @@ from coordinator.web.settings import WebSettings
 from nodes.dictionary.cache import DictionaryCache
 from nodes.support.host_sockets import socket_folder
 from nodes.support.state_folder import state_folder
-from nodes.support.terminal import show
 
 if TYPE_CHECKING:
     from coordinator.web.server import WebServer
@@ -126,6 +127,7 @@ class _ServiceProcess:
         self._load = load
         self._options = options
         self._cache = cache
+        self._console = Console(sys.stdout)
         self._announcer: AnnouncerProcess | None = None
         self._gateway: Gateway | None = None
         self._terminal: PseudoTerminal | None = None
@@ -164,6 +166,7 @@ class _ServiceProcess:
         )
         page = self._page(registry, service)
         async with contextlib.AsyncExitStack() as stack:
+            stack.push_async_callback(asyncio.to_thread, self._console.close)
             if self._options.log_file is not None:
                 self._log_file = ServiceLog(service, self._options.config, self._options.log_file)
                 stack.push_async_callback(self._log_file.close)
@@ -180,7 +183,7 @@ class _ServiceProcess:
             self._open_terminal(service, stop_path.lane, stack)
             self._announce(service, stack)
             if sys.stdin is not None and sys.stdin.isatty():
-                typed = Typed(service, _print)
+                typed = Typed(service, self._console.show)
                 stack.callback(typed.close)
                 stop_path.lane.look_also(typed.find_stop)
             stop_path.start()
@@ -191,12 +194,12 @@ class _ServiceProcess:
                 self.cut_off = service.cut_off
 
     def _report_addresses(self, page: "WebServer | None") -> None:
-        _print(f"serving at {self.path}")
+        self._console.show(f"serving at {self.path}")
         if self._options.tcp is not None:
-            _print(f"serving at {_address(self._options, self._server.tcp_port)}")
+            self._console.show(f"serving at {_address(self._options, self._server.tcp_port)}")
         if page is not None:
-            _print(f"the live page is at {page.url}")
-            _print(
+            self._console.show(f"the live page is at {page.url}")
+            self._console.show(
                 f"to get in, open {page.new_link(Scope.OPERATE)} within {LINK_S / 60:.0f} minutes;"
                 " it works once, 'canductor page' prints another"
             )
@@ -217,7 +220,7 @@ class _ServiceProcess:
         )
         await self._gateway.start(path)
         stack.push_async_callback(self._gateway.close)
-        _print(f"serving Moonraker at {path}")
+        self._console.show(f"serving Moonraker at {path}")
 
     def _open_terminal(
         self, service: MachineService, stop_lane: StopLane, stack: contextlib.AsyncExitStack
@@ -230,7 +233,7 @@ class _ServiceProcess:
         self._terminal.start()
         stack.push_async_callback(self._terminal.close)
         stop_lane.look_also(self._terminal.find_stop)
-        _print(f"serving a serial host at {path}")
+        self._console.show(f"serving a serial host at {path}")
 
     def _page(self, registry: Registry, service: MachineService) -> "WebServer | None":
         """Return the live page if it is asked for, with its methods in REGISTRY."""
@@ -261,7 +264,9 @@ class _ServiceProcess:
         metrics = make_metrics(fields, about, self._options.metrics, is_open=self._options.metrics_open)
         await metrics.start()
         stack.push_async_callback(metrics.close)
-        _print(f"metrics are at http://{bracketed(self._options.metrics[0])}:{metrics.port}/metrics")
+        self._console.show(
+            f"metrics are at http://{bracketed(self._options.metrics[0])}:{metrics.port}/metrics"
+        )
 
     def _announce(self, service: MachineService, stack: contextlib.AsyncExitStack) -> None:
         """Announce the machine on the network, if wanted."""
@@ -290,7 +295,7 @@ class _ServiceProcess:
 
     def _on_entry(self, service: MachineService, entry: Entry) -> None:
         self._server.notify("log", dict(entry))
-        _print(str(entry["text"]))
+        self._console.show(str(entry["text"]))
         if self._gateway is not None:
             self._gateway.note(entry)
         if self._terminal is not None:
@@ -321,7 +326,3 @@ def _address(options: ServeOptions, port: int | None) -> str:
     host = options.tcp[0]
     scheme = "tls" if options.certificate is not None else "tcp"
     return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
-
-
-def _print(line: str) -> None:
-    show(line)

@@ -5,6 +5,8 @@ import http.client
 import json
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +26,7 @@ from tests.stages.processes import (
 )
 
 LIMIT_S = 60.0
+PIPE_BYTES = 1 << 16
 
 
 def own_port(number: int) -> int:
@@ -88,6 +91,24 @@ def test_a_machine_is_served(machine: Hardware, tmp_path: Path) -> None:
         ended = command.end()
     assert (ended.status, ended.stderr) == (0, "")
     assert not path.exists()
+
+
+def test_an_output_that_nobody_reads_holds_nothing(machine: Hardware, tmp_path: Path) -> None:
+    """As where Ctrl-S was pressed in its terminal: it held the control loop, and so the heaters, for ever."""
+    path = tmp_path / "run.sock"
+    words = (sys.executable, "-m", "coordinator.cli.main", "run", machine.config, "--ipc", path)
+    with subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        while process.stdout.readline() != b"ready\n":
+            assert process.poll() is None
+        with BlockingClient(str(path), timeout_s=LIMIT_S) as client:
+            for _ in range(PIPE_BYTES // 500):
+                client.call("gcode.run", {"script": f"M118 {'x' * 1000}"})
+            assert (
+                client.call("state.get", {"fields": ["machine.state"]})["values"]["machine.state"] == "ready"
+            )
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(LIMIT_S) == 0
 
 
 def test_emergency_stop_and_restart(machine: Hardware, tmp_path: Path) -> None:

@@ -3,7 +3,8 @@
 import threading
 from pathlib import Path
 
-from coordinator.front_ends.log_file import FILE_BYTES_MAX, KEPT, LINE_CHARS_MAX, WAITING_MAX, LogFile
+from coordinator.front_ends.log_file import FILE_BYTES_MAX, KEPT, LogFile
+from coordinator.front_ends.writing_thread import LINE_CHARS_MAX, WAITING_MAX
 
 BLOCK = "\n".join("x" * (LINE_CHARS_MAX - 1) for _ in range(FILE_BYTES_MAX // LINE_CHARS_MAX // 2 + 1))
 

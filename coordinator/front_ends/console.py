@@ -1,0 +1,45 @@
+"""What a service says on standard output: its log, and what it answers to lines that are typed."""
+
+import os
+import select
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, TextIO
+
+from coordinator.front_ends.writing_thread import WritingThread
+
+END_S: Final = 1.0
+"""An output that nobody reads keeps a service no longer at its end."""
+
+
+class Console:
+    """Writes to STREAM, standard output; None: there is none.
+
+    Where nobody reads it, because a pipe is full or Ctrl-S was pressed, lines wait, and what is too much is
+    left out. Where it is closed, all of it is.
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self._fd = -1 if stream is None else stream.fileno()
+        self._encoding = "utf-8" if stream is None else stream.encoding
+        self._thread = WritingThread("standard output", self._write, "nobody read them")
+
+    def show(self, text: str) -> None:
+        """Write the lines of TEXT."""
+        self._thread.add(lambda: text)
+
+    def close(self, wait_s: float = END_S) -> None:
+        """Wait until all is written, for WAIT_S at most; then nothing waits for this output any more."""
+        if not self._thread.close(wait_s):
+            with Path(os.devnull).open("wb") as nothing:
+                os.dup2(nothing.fileno(), self._fd)
+
+    def _write(self, text: str) -> None:
+        # Not by the stream: the interpreter waits for its lock at the end.
+        data = text.encode(self._encoding, errors="replace")
+        with suppress(OSError):  # it is closed
+            while data and self._fd >= 0:
+                try:
+                    data = data[os.write(self._fd, data) :]
+                except BlockingIOError:  # another program may have it so that writing does not wait
+                    select.select([], [self._fd], [])
