@@ -8,6 +8,7 @@ calls of the system for each round, and wakes nobody while the loop is quick. It
 import asyncio
 import ctypes
 import os
+import select
 import selectors
 import socket
 import sys
@@ -38,6 +39,7 @@ FRAMES_MAX: Final = 8
 _CLOCK_MONOTONIC: Final = 1
 _CLOSE_ON_EXEC: Final = os.O_CLOEXEC
 _SIGNALS_BYTES: Final = 65_536
+_STANDARD_ERROR: Final = 2
 
 
 class _Times(ctypes.Structure):
@@ -171,7 +173,7 @@ class LoopWatchdog:
                 self._look(since_s)
             except Exception:  # noqa: BLE001 (it has to go on: it may be what stops the machine)
                 if self._failed_s != since_s:  # once for each hold
-                    show_error(traceback.format_exc())
+                    _say(traceback.format_exc())
                 self._failed_s = since_s
             finally:
                 sys.setswitchinterval(usual_s)
@@ -183,7 +185,7 @@ class LoopWatchdog:
             self._first = (since_s, now_s, time.clock_gettime(self._cpu_clock))
         if now_s - since_s >= STUCK_S and self._stuck_s != since_s:
             self._stuck_s = since_s
-            show_error(f"canductor: the control loop is held for {STUCK_S:g} s by {self._where()}")
+            _say(f"canductor: the control loop is held for {STUCK_S:g} s by {self._where()}")
         if now_s - since_s < HELD_S or self._seen_s == since_s:
             return
         self._seen_s = since_s
@@ -220,3 +222,11 @@ def stack_of(frame: FrameType | None) -> str:
         if "/asyncio/" not in call.filename:
             calls.append(f"{call.name} ({'/'.join(call.filename.split('/')[-2:])}:{call.lineno})")
     return " < ".join(calls[:FRAMES_MAX]) or "asyncio itself"
+
+
+def _say(text: str) -> None:
+    """Write the line TEXT to standard error, unless nobody reads there: this thread must not wait."""
+    poll = select.poll()
+    poll.register(_STANDARD_ERROR, select.POLLOUT)
+    if poll.poll(0) == [(_STANDARD_ERROR, select.POLLOUT)]:
+        show_error(text)

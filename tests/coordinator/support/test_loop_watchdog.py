@@ -1,11 +1,13 @@
 """The watchdog of the control loop: what it does while the loop is held, and what it reports of that."""
 
 import asyncio
+import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import pytest
 
@@ -95,3 +97,36 @@ def test_signals_that_wait_are_seen_while_the_loop_is_held() -> None:
     assert set(seen) == {signal.SIGUSR1}
     assert came, "the loop has it, too"
     assert came[0] > 0, "and later"
+
+
+@contextmanager
+def unread_errors() -> Iterator[None]:
+    """Let standard error be a pipe that is full."""
+    reads, writes = os.pipe()
+    os.set_blocking(writes, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writes, bytes(4096))
+    os.set_blocking(writes, True)
+    usual = os.dup(2)
+    os.dup2(writes, 2)
+    with os.fdopen(writes, "w", encoding="utf-8") as stream:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "stderr", stream)
+            yield
+        os.dup2(usual, 2)
+        os.close(usual)
+        os.close(reads)
+
+
+def test_the_thread_does_not_wait_for_who_reads_its_errors() -> None:
+    watched, looks = Watched(), iter((True,))
+
+    def look() -> None:
+        if next(looks, False):
+            raise RuntimeError("shown")
+
+    watched.looks = look
+    with unread_errors():
+        watched.run(watched.hold_the_loop)
+    assert len(watched.reports) == 1
