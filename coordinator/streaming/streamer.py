@@ -288,11 +288,15 @@ class Streamer:
     async def _settle(self, thread: ThreadPoolExecutor) -> None:
         """Bring what is left to the nodes and wait until the last step is executed."""
         loop = asyncio.get_running_loop()
-        while self.print_time_now() < self.ended_s + self.worker.steps.lag_s + SETTLE_S:
+        ends_s = self.ended_s + self.worker.steps.lag_s + SETTLE_S
+        ended = False
+        while not ended:
+            ended = self.print_time_now() >= ends_s  # then once more, so that what ended last is reported
             cycle = await loop.run_in_executor(thread, self.worker.rest)
             self._hand_over(cycle)
             self._report_cycle(cycle)
-            await asyncio.sleep(CYCLE_S)
+            if not ended:
+                await asyncio.sleep(CYCLE_S)
         self._act(self._due.rest())
         for node in self._nodes:
             await link_of(node).drained()

@@ -31,3 +31,25 @@ def test_motion_begins_later_on_a_slow_computer(tmp_path: Path) -> None:
 
     with asyncio.Runner(loop_factory=partial(world.make_loop, executor_s=SLOW_S)) as runner:
         runner.run(go())
+
+
+def test_who_asks_for_a_restart_is_answered_on_a_busy_computer(tmp_path: Path) -> None:
+    """Failed before: "the machine stopped: it restarts", where the last pause took a little longer."""
+    world = Stage(load(CLEAN), 1)
+
+    async def other_programs() -> None:
+        while True:
+            await asyncio.sleep(0.031)
+            world.stall(0.03, io=False)
+
+    async def go() -> None:
+        async with running(Served(tmp_path, lambda: world.description, world.host)) as stage:
+            await asyncio.sleep(1.0)
+            busy = asyncio.ensure_future(other_programs())
+            await stage.call("gcode.run", script="RESTART")
+            busy.cancel()
+            await stage.until(lambda: stage.service.starts == 2, "the next start")
+            await stage.until_state("ready")
+
+    with asyncio.Runner(loop_factory=world.make_loop) as runner:
+        runner.run(go())
