@@ -3,8 +3,8 @@
 Usage: python -m tests.fuzz.live_noise FOLDER PAGE TLS METRICS FD SEED; ends with its standard input, and is
 quiet from a line ``rest`` there to a line ``go``. PAGE,
 TLS and METRICS are ports, PAGE several with commas between; FD is the file descriptor of the terminal.
-What is sent is bytes, requests of HTTP and parts of them, beginnings of TLS, lines of nonsense, and uploads
-that are broken off. Prints one JSON line: how many bursts came on each way.
+What is sent is bytes, requests of HTTP and parts of them, beginnings of TLS, lines of nonsense, hundreds of
+empty ones at once, and uploads that are broken off. Prints one JSON line: how many bursts came on each way.
 """
 
 import json
@@ -54,6 +54,8 @@ def main() -> None:
         return chance.randbytes(chance.randrange(1, size))
 
     def nonsense() -> bytes:
+        if chance.random() < 0.05:
+            return chance.choice((b"\n", b";\n")) * chance.randrange(1, 1500)
         return bytes(chance.choices(LETTERS, k=chance.randrange(1, 80))) + b"\n"
 
     def request() -> bytes:
