@@ -95,9 +95,8 @@ class _WatchedSelector(selectors.DefaultSelector):
         self.timer.close()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        if timeout is None or timeout > 0:  # else it does not rest, and is armed anew below
-            self.busy_since_s = 0.0
-            self.timer.disarm()
+        self.busy_since_s = 0.0
+        self.timer.disarm()
         events = super().select(timeout)
         self.busy_since_s = time.monotonic()
         self.timer.arm()
