@@ -22,9 +22,12 @@ class StopPath:
     """
 
     def __init__(self, service: MachineService) -> None:
-        self.lane = StopLane(self.stop)
+        self.lane = StopLane(self._stop)
+        service.find_unread_stop = self.lane.find
         self._service = service
         self._loop = asyncio.get_running_loop()
+        self._looked_for: Machine | None = None
+        """The machine that ran when a look began: what is found in it does not concern a later one."""
         self._stopped: Machine | None = None
         self._watchdog: LoopWatchdog | None = None
         if isinstance(self._loop, WatchedLoop):
@@ -41,23 +44,29 @@ class StopPath:
             self._watchdog.close()
         self.lane.close()
 
-    def stop(self, who: str) -> None:
-        """Stop the nodes at once, and have the loop enter that WHO did; in any thread."""
+    def _stop(self, who: str) -> None:
+        """Stop the nodes at once, and have the loop enter that WHO did."""
         self._stop_nodes(lambda: self._service.emergency_stop(who))
 
     def _stop_nodes(self, then: Callable[[], None]) -> None:
-        """Stop the nodes of the machine that runs, unless that was done; the loop calls THEN when it can."""
-        machine = self._service.machine
+        """Stop the nodes of the machine, unless that was done; the loop calls THEN when it can."""
+        machine = self._looked_for
         if machine is None or machine is self._stopped or machine.stopped is not None:
             return
         self._stopped = machine
+
+        def announced() -> None:
+            if self._service.machine is machine:  # else the loop has read it before: a later one runs
+                then()
+
         # First: what the nodes report of their stop must not come to the loop before the cause.
-        machine.announced_stop = then
+        machine.announced_stop = announced
         with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(machine.stop_as_announced)
         machine.stop_nodes()
 
     def _while_held(self) -> None:
+        self._looked_for = self._service.machine
         self.lane.look()
         if (
             isinstance(self._loop, WatchedLoop)

@@ -86,6 +86,12 @@ class HttpServer:
             request.protocol.note_answer()
 
     @staticmethod
+    def hear(request: web.BaseRequest, feed: Callable[[bytes], None]) -> None:
+        """Have FEED get what comes on the connection of REQUEST, too, from now on."""
+        assert isinstance(request.protocol, _Handler)
+        request.protocol.hear(feed)
+
+    @staticmethod
     def keep(request: web.BaseRequest) -> None:
         """Let the connection of REQUEST stay beyond its time: it is a WebSocket now."""
         assert isinstance(request.protocol, _Handler)
@@ -134,6 +140,11 @@ class _Handler(web.RequestHandler):
         self._unanswered = b""
         """What came since the last answer: half a request may have been read when the loop is held."""
         self._reads_requests = True
+        self._feed: Callable[[bytes], None] | None = None
+
+    def hear(self, feed: Callable[[bytes], None]) -> None:
+        """Have FEED get what comes, too."""
+        self._feed = feed
 
     def keep(self) -> None:
         """Lift the limit of time; no further requests come."""
@@ -161,11 +172,21 @@ class _Handler(web.RequestHandler):
     def data_received(self, data: bytes) -> None:
         if self._reads_requests:
             self._unanswered = (self._unanswered + data)[:UNANSWERED_MAX]
+        if self._feed is not None:
+            self._feed(data)
         super().data_received(data)
 
     def connection_lost(self, exc: BaseException | None) -> None:
-        self.keep()
+        if not self._unanswered:
+            self.keep()
         super().connection_lost(exc)
+
+    async def start(self) -> None:
+        """Answer the requests; those that have come are carried out when the client has left, too."""
+        try:
+            await super().start()
+        finally:
+            self.keep()
 
     def _end(self) -> None:
         if self.transport is not None:

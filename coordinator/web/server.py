@@ -25,7 +25,7 @@ from coordinator.web.names import is_known_host, is_own_origin
 from coordinator.web.session_file import read_sessions, write_sessions
 from coordinator.web.settings import WebSettings
 from coordinator.web.stop_request import BODY_BYTES_MAX, STOP_PATH, parse_request, read_body
-from coordinator.web.websocket_frames import lines_in
+from coordinator.web.websocket_frames import UnrelayedMessages
 from coordinator.web.websocket_transport import WebSocketTransport
 from nodes.support.errors import CanductorError
 
@@ -324,13 +324,19 @@ class WebServer:
             return web.Response(status=401, text="sign in first\n", headers=HEADERS)
         if self._access.note_use(session, time.time()):
             await self._save_sessions()
+        unrelayed = UnrelayedMessages(self._ipc.limits.message_bytes)
+        HttpServer.hear(request, unrelayed.feed)
         await socket.prepare(request)
         HttpServer.keep(request)
-        await self._relay(socket, request, session)
+        await self._relay(socket, request, session, unrelayed)
         return socket
 
     async def _relay(
-        self, socket: web.WebSocketResponse, request: web.BaseRequest, session: PageSession
+        self,
+        socket: web.WebSocketResponse,
+        request: web.BaseRequest,
+        session: PageSession,
+        unrelayed: UnrelayedMessages,
     ) -> None:
         """Carry messages both ways until one side ends."""
         transport = WebSocketTransport(socket)
@@ -339,7 +345,9 @@ class WebServer:
         )
         transport.connection = connection
         self._ipc.stop_lane.watch_transport(
-            connection, request.transport, lambda unread: connection.session.find_stop(lines_in(unread))
+            connection,
+            request.transport,
+            lambda unread: connection.session.find_stop(unrelayed.lines(unread)),
         )
         self._clients[connection] = session
         sending = asyncio.ensure_future(transport.run())
@@ -350,6 +358,7 @@ class WebServer:
                     await socket.close(code=1003, message=b"messages are JSON, as text")
                     break
                 begun = True
+                unrelayed.relayed()  # without an await: the stop lane finds it here or there
                 connection.receive(message.data.encode() + b"\n")
                 await transport.readable()
         finally:

@@ -173,7 +173,8 @@ class Machine:
     def restart(self) -> None:
         """Start it again, plainly, after a stop."""
         self._prints = False
-        self.operator.call("machine.restart")
+        # It is refused while the loop has not read the stop that the stop lane has carried out.
+        self.wait_for(lambda: self._is_done("machine.restart", {}), "the restart is accepted")
 
 
 # ------------------------------------------------------------------------------------------ ways to stop

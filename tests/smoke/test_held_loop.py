@@ -13,6 +13,7 @@ import pytest
 
 from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.client.client import Client
+from coordinator.ipc.protocol.methods import ApiError
 from tests.stages.held_service import PATIENCE_S, HeldService, serve_held
 
 
@@ -23,7 +24,37 @@ def a_command_and_a_signal(held: HeldService) -> None:
         held.wait_for(lambda: not held.fan_turns, "the node is stopped by the command")
     held.wait_for(lambda: "canductor (uid" in held.service.cause, "the cause is there")
     held.restart()
+    a_restart_right_behind(held)
+    a_line_behind_one_that_waits(held)
     cut_off(held)
+
+
+def a_restart_right_behind(held: HeldService) -> None:
+    """It would be undone (and was) when the loop reads the stop that the lane has carried out."""
+    refused: list[str] = []
+
+    def restart() -> None:
+        try:
+            held.service.restart()
+        except ApiError as error:
+            refused.append(error.sentence)
+
+    with estop(held.socket) as send, held.held():
+        send()
+        held.wait_for(lambda: not held.fan_turns, "the node is stopped by the command")
+        held.loop.call_soon_threadsafe(restart)
+    assert len(refused) == 1
+    assert "an emergency stop by 'canductor (uid" in refused[0]
+    held.restart()
+
+
+def a_line_behind_one_that_waits(held: HeldService) -> None:
+    """M112 is typed while the line before it is being done; it waited for the end of that."""
+    os.write(held.terminal, b"M109 S250\n")
+    held.wait_for(lambda: held.service.motion is not None and held.service.motion.feeder.busy, "it heats")
+    os.write(held.terminal, b"G28\nM112\n")
+    held.wait_for(lambda: not held.fan_turns, "the node is stopped by the line")
+    held.restart()
 
 
 @contextmanager

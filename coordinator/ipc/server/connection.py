@@ -104,8 +104,13 @@ class Connection(asyncio.BufferedProtocol):
         self._request_turn()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End everything that still runs for the client."""
+        """End everything that still runs for the client; a stop that waits for its turn is done."""
         del exc
+        while (unread := self.session.unread_bytes) and self.session.end_reason is None:
+            for request in self.session.read(self._loop.time()):
+                self._call(request)
+            if self.session.unread_bytes == unread:
+                break
         for handle in (self._timer, self._linger):
             if handle is not None:
                 handle.cancel()

@@ -216,14 +216,15 @@ class Session:
         """Return who stops the machine with what waits here and with the UNREAD bytes behind it; else None.
 
         In any thread; the session stays as it is. A twin of it reads the bytes, so that rights are the same.
+        A stop that runs counts: it has not begun, since it ends in its first step.
         """
-        if self.end_reason is not None or not (unread or self._reader.waiting_bytes or self._waiting):
+        waiting = (*tuple(self._running), *tuple(self._waiting))
+        if self.end_reason is not None or not (unread or self._reader.waiting_bytes or waiting):
             return None
         twin = Session(self.context, 0.0, number=self.number, peer=self.peer, granted=self.granted)
         twin.check_token = self._find_token
         twin.caller, twin._reader = self.caller, self._reader.copy()
         twin._reader.feed(unread, 0.0)
-        waiting = tuple(self._waiting)
         while True:
             before = twin._reader.waiting_bytes
             waiting = (*twin.read(0.0), *waiting, *twin._waiting)

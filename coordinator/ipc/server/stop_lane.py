@@ -103,6 +103,15 @@ class StopLane:
             self._accepting.clear()
             self._finders.clear()
 
+    def find(self) -> str | None:
+        """Return who stops the machine with what is unread; None: nobody. Stops nothing."""
+        failures: list[Exception] = []
+        with self._lock:
+            who = self._find(failures)
+        if who is None and failures:
+            raise failures[0]
+        return who
+
     # ---- On the loop, or in the lane's thread ----
 
     def watch_new(self, opened: socket.socket, find: Finder) -> None:

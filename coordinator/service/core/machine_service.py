@@ -148,6 +148,8 @@ class MachineService:
         """By somebody, while it starts, or is about to start again."""
         self._closing: Machine | None = None
         """The one before, while it is closed."""
+        self.find_unread_stop: Callable[[], str | None] = _nobody
+        """Returns who stops the machine with what has come and was not read; None: nobody does."""
 
     # ------------------------------------------------------------------------------------------- life
 
@@ -359,8 +361,12 @@ class MachineService:
     def restart(self, *, firmware: bool = False) -> None:
         """Restart with the configuration read again; raises ApiError while the machine starts or works.
 
-        Nodes are configured again where that is needed; with FIRMWARE all are reset.
+        Nodes are configured again where that is needed; with FIRMWARE all are reset. While a stop is unread
+        it raises ApiError, too: the stop lane may have carried it out, and read later it would stop the
+        machine that this makes.
         """
+        if (who := self.find_unread_stop()) is not None:
+            raise ApiError("busy", f"an emergency stop by {who} has just come; ask again when it is done")
         if self.state is ServiceState.STARTUP:
             raise ApiError("busy", "the machine is starting already")
         if self._restart.is_set():
@@ -546,6 +552,10 @@ class MachineService:
                 continue
             self._reading.clear()
             await self._reading.wait()
+
+
+def _nobody() -> None:
+    pass
 
 
 def _confirmations(confirmed_s: dict[str, float]) -> str:

@@ -1,4 +1,7 @@
-"""G-code typed at the terminal of a service: one line after the other, while clients are connected."""
+"""G-code typed at the terminal of a service: one line after the other, while clients are connected.
+
+M112 does not wait for the line before it: it stops the machine when it comes; lines that wait are left out.
+"""
 
 import asyncio
 import os
@@ -22,6 +25,7 @@ class Typed:
     """Runs typed lines on SERVICE and passes replies to SAY, until ``close`` or the end of the input."""
 
     def __init__(self, service: MachineService, say: Callable[[str], None]) -> None:
+        self._service = service
         registry = Registry()
         for method in motion_methods(service):
             registry.add(method)
@@ -51,10 +55,10 @@ class Typed:
             if _is_readable(self._fd) and (data := os.read(self._fd, _READ_BYTES)):
                 self._typed += data
                 self._loop.call_soon_threadsafe(self._take_typed)
-            lines = (self._rest + self._typed).rpartition(b"\n")[0].decode(errors="replace").splitlines()
+            lines = (self._rest + self._typed).split(b"\n")[:-1]
         finally:
             self._lock.release()
-        return BY_LINE if any(_is_stop(line) for line in lines) else None
+        return BY_LINE if any(map(_is_stop, lines)) else None
 
     def _take_typed(self) -> None:
         with self._lock:
@@ -73,6 +77,12 @@ class Typed:
 
     def _take(self, data: bytes) -> None:
         *lines, self._rest = (self._rest + data).split(b"\n")
+        stops = [index for index, line in enumerate(lines) if _is_stop(line)]
+        if stops:
+            while not self._lines.empty():
+                self._lines.get_nowait()
+            del lines[: stops[-1] + 1]
+            self._service.emergency_stop(BY_LINE)
         for line in lines:
             try:
                 self._lines.put_nowait(line.decode(errors="replace"))
@@ -101,8 +111,8 @@ def _is_readable(fd: int) -> bool:
     return bool(poll.poll(0))
 
 
-def _is_stop(line: str) -> bool:
+def _is_stop(line: bytes) -> bool:
     try:
-        return EMERGENCY in commands_in((line,))
+        return EMERGENCY in commands_in((line.decode(errors="replace"),))
     except CanductorError:  # no line of g-code
         return False

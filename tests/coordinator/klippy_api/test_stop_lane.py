@@ -7,12 +7,15 @@ import os
 import pty
 import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
 import pytest
 
-from coordinator.ipc.protocol.methods import Caller, Scope
+from coordinator.ipc.protocol.methods import Caller, Registry, Scope
+from coordinator.ipc.server.server import IpcServer
+from coordinator.ipc.server.settings import IpcSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.klippy_api.gateway import Gateway
@@ -20,6 +23,7 @@ from coordinator.runtime.linux_host import LinuxHost
 from coordinator.service.api.motion import motion_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.core.typed import Typed
+from tests.coordinator.ipc.server.test_stop_lane import Hog
 from tests.stages.jump_loop import run
 
 WHO = "a client of the Klippy API"
@@ -29,9 +33,25 @@ def _load() -> NoReturn:
     raise AssertionError("the service is not run")
 
 
-def _service() -> MachineService:
-    settings = ServiceSettings(name="test")
-    return MachineService(_load, LinuxHost(), StateTree(), settings, on_line=lambda _entry: None)
+class Service(MachineService):
+    """Notes who stops it; it is not run."""
+
+    def __init__(self) -> None:
+        settings = ServiceSettings(name="test")
+        super().__init__(_load, LinuxHost(), StateTree(), settings, on_line=lambda _entry: None)
+        self.stops: list[str] = []
+
+    def emergency_stop(self, who: str) -> None:
+        self.stops.append(who)
+        super().emergency_stop(who)
+
+    async def stops_once(self, find_stop: Callable[[], str | None]) -> None:
+        """Let the loop go on until it is stopped: FIND_STOP has to find it until then, and no longer."""
+        self.stops.clear()
+        while not self.stops:
+            assert find_stop() is not None
+            await asyncio.sleep(0)
+        assert find_stop() is None
 
 
 def call(method: str, **params: str) -> bytes:
@@ -44,7 +64,7 @@ def test_old_and_new_clients_stop_the_machine(tmp_path: Path) -> None:
     async def main() -> None:
         stops: list[str] = []
         lane = StopLane(stops.append)
-        service = _service()
+        service = Service()
         gateway = Gateway(service, Path("printer.cfg"), on_notice=lambda _text: None, stop_lane=lane)
         await gateway.start(path)
         reader, writer = await asyncio.open_unix_connection(path)
@@ -57,10 +77,12 @@ def test_old_and_new_clients_stop_the_machine(tmp_path: Path) -> None:
         writer.write(call("emergency_stop")[9:])
         lane.look()
         assert stops == [WHO]
+        await service.stops_once(lane.find)
         await reader.readuntil(b"\x03")
         writer.write(call("gcode/script", script="G28\n m112 ; now"))
         lane.look()
         assert stops == [WHO, f"M112 of {WHO}"]
+        await service.stops_once(lane.find)
         await reader.readuntil(b"\x03")
         writer.write(call("gcode/script", script="M117 emergency_stop M112") + b'{"emergency_stop":\x03')
         lane.look()
@@ -71,6 +93,7 @@ def test_old_and_new_clients_stop_the_machine(tmp_path: Path) -> None:
             new.sendall(call("emergency_stop"))
             lane.look()
             assert stops[2:] == [WHO]
+            await service.stops_once(lane.find)
             new.setblocking(False)
             answer = await asyncio.get_running_loop().sock_recv(new, 1000)
             assert json.loads(answer[:-1])["result"] == {}, "the loop serves it later"
@@ -80,12 +103,60 @@ def test_old_and_new_clients_stop_the_machine(tmp_path: Path) -> None:
     run(main())
 
 
+def test_a_client_that_leaves_before_its_turn_has_stopped_the_machine(tmp_path: Path) -> None:
+    """While others keep it waiting, the end of its connection is not read."""
+    path = tmp_path / "klippy.sock"
+
+    async def main() -> None:
+        lane, service = StopLane(), Service()
+        gateway = Gateway(service, Path("printer.cfg"), on_notice=lambda _text: None, stop_lane=lane)
+        await gateway.start(path)
+        for sent in (call("emergency_stop"), call("gcode/script", script="M112")):
+            reader, writer = await asyncio.open_unix_connection(path)
+            writer.write(call("info"))
+            await reader.readuntil(b"\x03")
+            service.stops.clear()
+            hogs = [Hog(gateway._scheduler) for _ in range(10)]
+            for hog in hogs:
+                gateway._scheduler.request_turn(hog)
+            writer.write(call("info") + sent)
+            writer.close()
+            while any(hog.rounds for hog in hogs) or gateway._connections:  # noqa: ASYNC110 (no event)
+                await asyncio.sleep(0)
+            assert len(service.stops) == 1
+        await gateway.close()
+
+    run(main())
+
+
 def test_lines_of_a_client_stop_the_machine() -> None:
-    (run_lines,) = [method for method in motion_methods(_service()) if method.name == "gcode.run"]
+    (run_lines,) = [method for method in motion_methods(Service()) if method.name == "gcode.run"]
     caller = Caller("a test", Scope.OPERATE)
     assert run_lines.stops(caller, {"script": "G28\nn1 m112"}) == "M112 of a client"
     for script in ("", "M117 M112", "M1120", "G28 X("):
         assert run_lines.stops(caller, {"script": script}) is None
+
+
+def test_a_line_of_a_client_is_unread_until_it_is_done(tmp_path: Path) -> None:
+    """Failed before: it was in neither place from the turn in which its task was made to the next."""
+    path = tmp_path / "api.sock"
+
+    async def main() -> None:
+        lane, service, registry = StopLane(), Service(), Registry()
+        for method in motion_methods(service):
+            registry.add(method)
+        server = IpcServer(registry, StateTree(), IpcSettings(unix_path=path), stop_lane=lane)
+        await server.start()
+        _, writer = await asyncio.open_unix_connection(path)
+        for name, params in (("api.hello", {"version": 1}), ("gcode.run", {"script": "G28\nM112"})):
+            writer.write(json.dumps({"id": 1, "method": name, "params": params}).encode() + b"\n")
+        while lane.find() is None:  # noqa: ASYNC110 (there is no event for it)
+            await asyncio.sleep(0)
+        await service.stops_once(lane.find)
+        writer.close()
+        await server.close()
+
+    run(main())
 
 
 def test_a_line_typed_at_the_terminal_stops_the_machine(
@@ -95,16 +166,19 @@ def test_a_line_typed_at_the_terminal_stops_the_machine(
 
     async def main() -> None:
         said: list[str] = []
-        service = _service()
+        service = Service()
         typed = Typed(service, said.append)
         assert typed.find_stop() is None
         os.write(user, b"M114\nM1")
         assert typed.find_stop() is None
         os.write(user, b"12 ; stop\n")
         assert typed.find_stop() == "M112 of a client"
-        await asyncio.sleep(0.1)
-        assert len(said) == 1, "the loop has M114, which nothing can answer yet; M112 has no answer"
-        assert typed.find_stop() is None
+        await service.stops_once(typed.find_stop)
+        os.write(user, b"M114\n")
+        while not said:  # noqa: ASYNC110 (there is no event for it)
+            await asyncio.sleep(0)
+        assert len(said) == 1, "lines before M112 are left out, those behind it are not"
+        assert service.stops == ["M112 of a client"]
         typed.close()
 
     with os.fdopen(terminal) as stdin, contextlib.closing(os.fdopen(user, "rb", buffering=0)):

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.fair_scheduler import ROUND_S, FairScheduler
 from coordinator.ipc.server.settings import TcpSettings
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.web.settings import WebSettings
@@ -56,6 +57,13 @@ class Lane(StopLane):
             pass
         return self.stops == stops
 
+    async def is_unread_until_done(self, done: list[str]) -> None:
+        """Let the loop go on until it has DONE a stop: it has to be found until then, and no longer."""
+        while not done:
+            assert self.find() is not None
+            await asyncio.sleep(0)
+        assert self.find() is None
+
 
 def test_a_client_stops_the_machine_and_gets_its_answer_later(tmp_path: Path) -> None:
     lane = Lane()
@@ -68,6 +76,7 @@ def test_a_client_stops_the_machine_and_gets_its_answer_later(tmp_path: Path) ->
         assert len(lane.seen()) == 1
         assert lane.stops[0].startswith("old (uid")
         assert served.stops == [], "the loop has not read it"
+        await lane.is_unread_until_done(served.stops)
         assert {(await script.receive())["id"] for _ in range(2)} == {5, 6}
         assert served.stops == lane.stops, "it carries out what it reads, in its turn"
         script.send("machine.info", 7, what="machine.emergency_stop")
@@ -87,6 +96,7 @@ def test_a_stop_whose_first_bytes_were_read_is_seen(tmp_path: Path, cut: int) ->
         assert lane.seen() == []
         script.writer.write(sent[cut:])
         assert lane.seen() == ["me"]
+        await lane.is_unread_until_done(served.stops)
         await script.receive()
 
     run(tmp_path, go, stop_lane=lane)
@@ -162,6 +172,8 @@ def test_the_page_stops_the_machine(tmp_path: Path, certificate: tuple[Path, Pat
                     await page.ping()
                     await page.send_str(json.dumps(STOP))
                     assert lane.sees(stops)
+                    if stops:
+                        await lane.is_unread_until_done(paged.served.stops)
 
     async def main() -> None:
         async with paging(tmp_path, settings, stop_lane=lane) as paged:
@@ -182,6 +194,49 @@ def test_a_client_that_has_left_is_forgotten(tmp_path: Path) -> None:
         assert lane.seen() == []
 
     run(tmp_path, go, stop_lane=lane)
+
+
+class Hog:
+    """A client with so much work that others wait for their turn many rounds."""
+
+    def __init__(self, scheduler: FairScheduler) -> None:
+        self._scheduler = scheduler
+        self.rounds = 20
+
+    def work(self, until_s: float) -> bool:
+        del until_s
+        self._scheduler._spent_s = ROUND_S
+        self.rounds -= 1
+        return self.rounds > 0
+
+    def pause(self) -> None:
+        pass
+
+
+@TLS
+def test_a_client_that_leaves_before_its_turn_has_stopped_the_machine(
+    tmp_path: Path, certificate: tuple[Path, Path], *, secret: bool
+) -> None:
+    """Failed before: what it had sent was forgotten."""
+    lane, chosen = Lane(), certificate if secret else None
+
+    async def go(served: Served) -> None:
+        scheduler = served.server._scheduler
+        assert scheduler is not None
+        dialled = Dialled(served.server.tcp_port or 0, chosen)
+        while not dialled.shake_hands():  # noqa: ASYNC110 (there is no event for it)
+            await asyncio.sleep(0)
+        while not served.server.figures()["connections"]:  # noqa: ASYNC110 (likewise)
+            await asyncio.sleep(0)
+        for _ in range(10):
+            scheduler.request_turn(Hog(scheduler))
+        dialled.send(line({**HELLO, "params": {"version": 1, "token": TOKENS[Scope.OPERATE]}}) + line(STOP))
+        dialled.close()
+        while served.server.figures()["connections"]:  # noqa: ASYNC110 (likewise)
+            await asyncio.sleep(0)
+        assert served.stops == ["me"]
+
+    run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, chosen))
 
 
 def over(folder: Path, certificate: tuple[Path, Path] | None) -> TcpSettings:
@@ -294,8 +349,7 @@ def test_a_new_connection_that_the_loop_has_begun_to_take(tmp_path: Path, rounds
             opened.sendall(line(STOP))
             assert lane.seen() == ["me"]
             assert served.stops == []
-            while not served.stops:  # noqa: ASYNC110 (there is no event for it)
-                await asyncio.sleep(0)
+            await lane.is_unread_until_done(served.stops)
 
     run(tmp_path, go, stop_lane=lane)
 
@@ -319,8 +373,7 @@ def test_a_new_connection_over_tcp_that_the_loop_has_begun_to_take(
             done = dialled.shake_hands()
         dialled.send(hello + line(STOP))
         assert lane.sees(["me"])
-        while not served.stops:  # noqa: ASYNC110 (there is no event for it)
-            await asyncio.sleep(0)
+        await lane.is_unread_until_done(served.stops)
         dialled.close()
         await served.server_has(0)
 
@@ -443,8 +496,7 @@ def test_a_page_without_a_connection_stops_the_machine(
         dialled.send(data[cut:])
         assert lane.sees(["me"])
         assert paged.served.stops == [], "the loop has not read it"
-        while not paged.served.stops:  # noqa: ASYNC110 (there is no event for it)
-            await asyncio.sleep(0)
+        await lane.is_unread_until_done(paged.served.stops)
         answer = b""
         while b'"state"' not in answer:
             await asyncio.sleep(0)
@@ -456,6 +508,30 @@ def test_a_page_without_a_connection_stops_the_machine(
         dialled.send(data)
         assert lane.sees(["me"]), "the connection is kept alive"
         dialled.close()
+
+    run_page(tmp_path, chosen, lane, go)
+
+
+@TLS
+@pytest.mark.parametrize("is_new", [True, False])
+def test_a_page_that_leaves_right_behind_its_request(
+    tmp_path: Path, certificate: tuple[Path, Path], *, secret: bool, is_new: bool
+) -> None:
+    """Failed before: nobody found the stop from the end of the connection until it was done."""
+    lane, chosen = Lane(), certificate if secret else None
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in()
+        data, others = paged.stop_request(), set(lane._unread)
+        dialled = request_stop(paged, lane, chosen, b"" if is_new else data[:10])
+        if not is_new:
+            await asyncio.sleep(0.1)
+        dialled.send(data if is_new else data[10:])
+        assert lane.sees(["me"])
+        dialled.close()
+        await lane.is_unread_until_done(paged.served.stops)
+        await asyncio.sleep(0.1)
+        assert set(lane._unread) == others
 
     run_page(tmp_path, chosen, lane, go)
 
@@ -485,8 +561,7 @@ def test_a_page_on_a_connection_that_has_served_it(
         assert lane.seen() == []
         dialled.send(data[cut:])
         assert lane.sees(["me"])
-        while not paged.served.stops:  # noqa: ASYNC110 (there is no event for it)
-            await asyncio.sleep(0)
+        await lane.is_unread_until_done(paged.served.stops)
         assert paged.served.stops == ["me"]
         dialled.close()
 
@@ -511,8 +586,7 @@ def test_a_request_of_the_page_that_the_loop_has_begun_to_take(
             await asyncio.sleep(0)
         if not paged.served.stops:
             assert lane.sees(["me"])
-        while not paged.served.stops:  # noqa: ASYNC110 (there is no event for it)
-            await asyncio.sleep(0)
+        await lane.is_unread_until_done(paged.served.stops)
         lane.stops.clear()
         assert lane.seen() == []
         dialled.close()
