@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import signal
+import threading
 from collections.abc import Callable
 from typing import Final
 
@@ -26,6 +27,7 @@ class StopPath:
         service.find_unread_stop = self.lane.find
         self._service = service
         self._loop = asyncio.get_running_loop()
+        self._loop_thread = threading.get_ident()
         self._looked_for: Machine | None = None
         """The machine that ran when a look began: what is found in it does not concern a later one."""
         self._stopped: Machine | None = None
@@ -45,8 +47,11 @@ class StopPath:
         self.lane.close()
 
     def _stop(self, who: str) -> None:
-        """Stop the nodes at once, and have the loop enter that WHO did."""
-        self._stop_nodes(lambda: self._service.emergency_stop(who))
+        """Have WHO stop the machine: on the loop as a whole, in the thread its nodes, and the loop enters it."""
+        if threading.get_ident() == self._loop_thread:
+            self._service.emergency_stop(who)
+        else:
+            self._stop_nodes(lambda: self._service.emergency_stop(who))
 
     def _stop_nodes(self, then: Callable[[], None]) -> None:
         """Stop the nodes of the machine, unless that was done; the loop calls THEN when it can."""

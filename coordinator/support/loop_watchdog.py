@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from nodes.support.terminal import show_error
 
-LOOK_S: Final = 0.02
+LOOK_S: Final = 0.01
 """From so long on, a loop that is still at work is looked at."""
 AGAIN_S: Final = 0.005
 """Between further looks; a TLS handshake takes three of them."""

@@ -49,7 +49,7 @@ BOUNDS_MS: Final = {"free": 10.0, "held": 50.0, "calculating": 50.0}
 """Of the time to the node's pin, by the state of the loop."""
 OWN_ADDRESS: Final = "127.0.0.9"
 """From here stops come over TCP: wrong tokens lock the fuzzers' addresses out."""
-LEAST_PRIORITY: Final = ("nice", "-n", "19")
+LEAST_PRIORITY: Final = ("chrt", "--idle", "0")
 PATIENCE_S: Final = 60.0
 LOOK_S: Final = 0.005
 PROGRAM: Final = "SET_KINEMATIC_POSITION X=100 Y=100 Z=10\n" + "G1 X20 F3000\nG1 X180\n" * 500

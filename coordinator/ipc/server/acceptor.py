@@ -19,6 +19,8 @@ ACCEPTS_PER_ROUND: Final = 8
 """Connections taken before the rest of the loop gets its turn."""
 RETRY_S: Final = 0.2
 """After the system had no file left for a connection."""
+LOOKS: Final = 6
+"""Rounds of the loop, all of them busy ones maybe, until a connection has its protocol and is read."""
 HELD_MAX: Final = 64
 """Connections that are accepted while the loop is held; others wait for the loop."""
 
@@ -92,6 +94,12 @@ class Acceptor:
                 self._retry = self._loop.call_later(RETRY_S, self._accept_again)
                 return
             arrival.serve()
+            self._look_at(arrival, LOOKS)
+
+    def _look_at(self, arrival: Arrival, looks: int) -> None:
+        """Look for a stop in each round until somebody reads the connection: its turn may be far off."""
+        if self._lane.look_at_new(arrival.opened) and looks > 1:
+            self._loop.call_soon(self._look_at, arrival, looks - 1)
 
     def _accept_again(self) -> None:
         self._loop.add_reader(self._listener, self._accept)

@@ -29,7 +29,7 @@ def _ignore(_: str) -> None:
 
 
 class StopLane:
-    """Looks at what is unread; STOP is called with who stops the machine, in the lane's thread."""
+    """Looks at what is unread; STOP is called with who stops the machine, in the thread that has looked."""
 
     def __init__(self, stop: Callable[[str], None] = _ignore) -> None:
         self._stop = stop
@@ -102,6 +102,15 @@ class StopLane:
             self._peeking.clear()
             self._accepting.clear()
             self._finders.clear()
+
+    def look_at_new(self, opened: socket.socket) -> bool:
+        """Look at OPENED, just accepted; return whether it is new still."""
+        with self._lock:
+            find = self._new.get(opened)
+            who = None if find is None else find()
+        if who is not None:
+            self._stop(who)
+        return find is not None
 
     def find(self) -> str | None:
         """Return who stops the machine with what is unread; None: nobody. Stops nothing."""

@@ -177,7 +177,7 @@ class TlsTransport(asyncio.Transport):
         self._raw = raw
         self._state.carried_by(raw, self._handle_news)
         self._loop.add_reader(self._state.socket, self._readable)
-        self._deliver()  # of the handshake, where it has begun
+        self._readable()  # the handshake may have begun
 
     def lost(self, error: Exception | None) -> None:
         """End: the connection is gone."""

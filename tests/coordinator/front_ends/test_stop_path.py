@@ -1,6 +1,7 @@
 """The stop path stops the machine for which a stop was sent, and no other."""
 
 import asyncio
+import threading
 from pathlib import Path
 
 from coordinator.assembly.load import load_machine
@@ -30,6 +31,13 @@ def _service() -> MachineService:
     )
 
 
+def look(path: StopPath) -> None:
+    """Look as the watchdog's thread does, while the loop has no turn."""
+    thread = threading.Thread(target=path._while_held)
+    thread.start()
+    thread.join()
+
+
 def test_a_machine_that_began_during_a_look_is_not_stopped() -> None:
     """The loop read the stop while the thread looked, and a restart followed; failed before."""
 
@@ -46,7 +54,7 @@ def test_a_machine_that_began_during_a_look_is_not_stopped() -> None:
             return "me"
 
         path.lane.look_also(find)
-        path._while_held()
+        look(path)
         await asyncio.sleep(0.1)
         assert after.stopped is None
         path.close()
@@ -64,12 +72,12 @@ def test_a_machine_that_begins_before_the_stop_is_entered_is_not_stopped() -> No
         before, after = _machine(), _machine()
         service.machine = before
         path.lane.look_also(lambda: "me")
-        path._while_held()
+        look(path)
         service.machine = after
         await asyncio.sleep(0.1)
         assert after.stopped is None
         service.machine = before
-        path._while_held()
+        look(path)
         await asyncio.sleep(0.1)
         assert before.stopped is None, "it was done already"
         path.close()
@@ -84,7 +92,7 @@ def test_the_machine_is_stopped_for_who_is_found() -> None:
         path, machine = StopPath(service), _machine()
         service.machine = machine
         path.lane.look_also(lambda: "me")
-        path._while_held()
+        look(path)
         assert machine.stopped is None, "the loop enters it, when it can"
         await asyncio.sleep(0.1)
         assert str(machine.stopped) == "emergency stop by me"

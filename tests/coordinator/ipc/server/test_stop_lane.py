@@ -43,7 +43,18 @@ class Lane(StopLane):
 
     def __init__(self) -> None:
         self.stops: list[str] = []
-        super().__init__(self.stops.append)
+        """Found by ``look``."""
+        self.early: list[str] = []
+        """Found on new connections by the loop."""
+        self._found = self.early
+        super().__init__(lambda who: self._found.append(who))
+
+    def look(self) -> None:
+        self._found = self.stops
+        try:
+            super().look()
+        finally:
+            self._found = self.early
 
     def seen(self) -> list[str]:
         """Look once, as the watchdog's thread does; return who stopped the machine by then."""
