@@ -47,7 +47,7 @@ class StopPath:
         self.lane.close()
 
     def _stop(self, who: str) -> None:
-        """Have WHO stop the machine: on the loop as a whole, in the thread its nodes, and the loop enters it."""
+        """Have WHO stop the machine; in the thread its nodes are stopped, and the loop enters the rest."""
         if threading.get_ident() == self._loop_thread:
             self._service.emergency_stop(who)
         else:

@@ -331,12 +331,12 @@ class Machine:
 
     def bus_stats(self) -> dict[str, IOStats]:
         """Return the counters of every bus that is open, by its name."""
-        return {o.bus.name: o.bus.io.stats() for o in self._open if o.bus.closed_because is None}
+        return {o.bus.name: o.bus.io.stats() for o in self._open if o.bus.is_open}
 
     def check_load(self) -> None:
         """Raise BusOverload when a bus will not carry the motion queued on it in time."""
         for opened in self._open:
-            if opened.bus.closed_because is None:
+            if opened.bus.is_open:
                 opened.watch.look(
                     opened.bus.io.forecast(),
                     self.host.now(),
@@ -346,7 +346,7 @@ class Machine:
 
     def is_busy(self, load: float) -> bool:
         """Return whether a bus has carried more than LOAD lately, a share of its time."""
-        return any(o.bus.closed_because is None and o.bus.io.load().total > load for o in self._open)
+        return any(o.bus.is_open and o.bus.io.load().total > load for o in self._open)
 
     async def query_stepper_counts(self) -> dict[str, int]:
         """Ask every node where its steppers stand: steps from where they began, positive as motion counts."""

@@ -23,7 +23,7 @@ from nodes.support.terminal import show_error
 
 LOOK_S: Final = 0.01
 """From so long on, a loop that is still at work is looked at."""
-AGAIN_S: Final = 0.005
+AGAIN_S: Final = 0.002
 """Between further looks; a TLS handshake takes three of them."""
 HELD_S: Final = 0.05
 """Nothing may hold the loop for so long; it is reported."""

@@ -48,9 +48,14 @@ class BusBase:
         self._outage_until_s = float("-inf")
 
     @property
+    def is_open(self) -> bool:
+        """Whether ``io`` is there."""
+        return self._io is not None and self.closed_because is None
+
+    @property
     def io(self) -> LinkIoInterface:
         """The I/O of the bus; NodeLost when it is not open."""
-        if self._io is None or self.closed_because is not None:
+        if self._io is None or not self.is_open:
             cause = self.closed_because or "it is not open"
             raise NodeLost(f"bus {self.name} cannot be used: {cause}")
         return self._io
@@ -286,8 +291,7 @@ class _UartConnector:
 
     def missing(self, error: CanductorError) -> str:
         # Why the device cannot be opened is known; a device that is open has a board that does not answer.
-        opened = self._bus.closed_because is None
-        return f"nothing answers on {self._bus.name}" if opened else str(error)
+        return f"nothing answers on {self._bus.name}" if self._bus.is_open else str(error)
 
     def expect_reset(self) -> None:
         pass

@@ -4,11 +4,13 @@ Usage, from the project's root: python -m tests.fuzz.live_stops [--minutes M] [-
 
 Services on virtual nodes print, each in a process of its own (stopped_service.py). Clients that are random,
 wrong, slow or rude come and go on the Unix socket and TCP (live_visits.py), and random bytes come on all
-other ways in (live_noise.py), always at the machine that is stopped next. They stand for other computers:
-they take only the processor time that is left. An emergency stop is sent by the next way in, by turns while
-the control loop is free, while it is held by what waits, and while it is held by what calculates. A plain
-restart follows, and meanwhile the next machine is stopped: with five machines, there is a stop about every
-second. With --machines 1 the fuzzers are there during restarts, too.
+other ways in (live_noise.py), always at the machine that is stopped next. An emergency stop is sent by the
+next way in, by turns while the control loop is free, while it is held by what waits, and while it is held by
+what calculates. A plain restart follows, and meanwhile the next machine is stopped: with five machines, there
+is a stop about every second. With --machines 1 the fuzzers are there during restarts, too.
+
+Fuzzers and machines that restart stand for other computers: they get the processor time that nobody wants
+(SCHED_IDLE; for machines that needs root, or they compete with the one that is stopped).
 
 Each time is from before the stop's last bytes are sent to the edge of the node's pin. It ends with status 1
 when a stop has no effect, comes later than its bound or does not name who stopped, or when a restart fails.
@@ -151,11 +153,20 @@ class Machine:
         number = self._process.pid
         return int(Path(f"/proc/{number}/task/{number}/schedstat").read_text().split()[1]) * 1e-6
 
+    def _schedule(self, policy: int) -> None:
+        """Have the service compete for the processor as POLICY says, as far as the system permits it."""
+        if os.geteuid() != 0:  # nobody else gets back from SCHED_IDLE
+            return
+        for task in Path(f"/proc/{self._process.pid}/task").iterdir():
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setscheduler(int(task.name), policy, os.sched_param(0))
+
     def begin(self) -> None:
         """Have it print with the fan on, unless it does already; lines that were typed are done first."""
         if self._prints:
             return
         self.wait_for(lambda: self.state["state"] == "ready", "it is ready")
+        self._schedule(os.SCHED_OTHER)
         for method, params in (("gcode.run", {"script": "M106 S255"}), ("job.start", {"file": "long.gcode"})):
             self.wait_for(lambda: self._is_done(method, params), f"{method} is done")  # noqa: B023 (at once)
         self.wait_for(lambda: fan_turns(self.folder), "the fan turns")
@@ -175,6 +186,7 @@ class Machine:
         self._prints = False
         # It is refused while the loop has not read the stop that the stop lane has carried out.
         self.wait_for(lambda: self._is_done("machine.restart", {}), "the restart is accepted")
+        self._schedule(os.SCHED_IDLE)
 
 
 # ------------------------------------------------------------------------------------------ ways to stop

@@ -4,6 +4,7 @@ M112 does not wait for the line before it: it stops the machine when it comes; l
 """
 
 import asyncio
+import contextlib
 import os
 import select
 import sys
@@ -19,6 +20,10 @@ from nodes.support.errors import CanductorError
 
 LINES_MAX: Final = 1000
 _READ_BYTES: Final = 4096
+_TYPED_BYTES_MAX: Final = 16_384
+"""Of lines that wait for the loop; more wait in the terminal."""
+_NUMBER: Final = EMERGENCY.removeprefix("M").encode()
+"""In every line with that command."""
 
 
 class Typed:
@@ -36,8 +41,10 @@ class Typed:
         self._rest = b""
         self._lock = threading.Lock()
         """Held while the terminal is read, by the loop or by the thread that looks for a stop."""
-        self._typed = b""
-        """Read by that thread; the loop has it next."""
+        self._typed = bytearray()
+        """Read, maybe by that thread; the loop has it next."""
+        self._ended = False
+        """Whether the input has."""
         self._lines: asyncio.Queue[str] = asyncio.Queue(LINES_MAX)
         self._work = asyncio.ensure_future(self._work_off())
         self._loop.add_reader(self._fd, self._read)
@@ -47,33 +54,44 @@ class Typed:
         self._loop.remove_reader(self._fd)
         self._work.cancel()
 
+    # ---- In the loop, or in the thread that looks for a stop ----
+
     def find_stop(self) -> str | None:
         """Return who stops the machine by a line that was typed while the loop is held; in any thread."""
         if not self._lock.acquire(blocking=False):  # the loop is just reading, maybe for ever
             return None
         try:
-            if _is_readable(self._fd) and (data := os.read(self._fd, _READ_BYTES)):
-                self._typed += data
-                self._loop.call_soon_threadsafe(self._take_typed)
+            before = len(self._typed), self._ended
+            self._read_waiting()
+            if (len(self._typed), self._ended) != before:
+                with contextlib.suppress(RuntimeError):  # the loop has ended
+                    self._loop.call_soon_threadsafe(self._read)
             lines = (self._rest + self._typed).split(b"\n")[:-1]
         finally:
             self._lock.release()
         return BY_LINE if any(map(_is_stop, lines)) else None
 
-    def _take_typed(self) -> None:
-        with self._lock:
-            data, self._typed = self._typed, b""
-            self._take(data)
+    def _read_waiting(self) -> None:
+        """Read what was typed, as far as there is room for it; a terminal gives one line at a time."""
+        poll = select.poll()
+        poll.register(self._fd, select.POLLIN)
+        while len(self._typed) < _TYPED_BYTES_MAX and not self._ended and poll.poll(0):
+            try:
+                data = os.read(self._fd, _READ_BYTES)
+            except OSError:  # the terminal is gone
+                data = b""
+            self._typed += data
+            self._ended = not data
+
+    # ---- In the loop ----
 
     def _read(self) -> None:
         with self._lock:
-            if not _is_readable(self._fd):  # the other thread was faster
-                return
-            data = os.read(self._fd, _READ_BYTES)
-            if not data:
+            self._read_waiting()
+            data, self._typed = bytes(self._typed), bytearray()
+            if self._ended:
                 self._loop.remove_reader(self._fd)
-            typed, self._typed = self._typed, b""
-            self._take(typed + data)
+        self._take(data)
 
     def _take(self, data: bytes) -> None:
         *lines, self._rest = (self._rest + data).split(b"\n")
@@ -105,13 +123,9 @@ class Typed:
                 self._say(reply)
 
 
-def _is_readable(fd: int) -> bool:
-    poll = select.poll()
-    poll.register(fd, select.POLLIN)
-    return bool(poll.poll(0))
-
-
 def _is_stop(line: bytes) -> bool:
+    if _NUMBER not in line:  # most are not read twice
+        return False
     try:
         return EMERGENCY in commands_in((line.decode(errors="replace"),))
     except CanductorError:  # no line of g-code

@@ -179,6 +179,19 @@ def test_a_line_typed_at_the_terminal_stops_the_machine(
             await asyncio.sleep(0)
         assert len(said) == 1, "lines before M112 are left out, those behind it are not"
         assert service.stops == ["M112 of a client"]
+        os.write(user, b"\n" * 1500 + b"M112\n")
+        assert typed.find_stop() == "M112 of a client", "in one look, though a terminal gives line by line"
+        await service.stops_once(typed.find_stop)
+        os.write(user, b"M114\n" * 700)
+        typed.find_stop()
+        os.write(user, b"M114\n" * 700)
+        assert len(said) == 1
+        while len(said) < 1401:  # noqa: ASYNC110 (there is no event for it)
+            await asyncio.sleep(0)
+        os.write(user, b"\x04M112\n")
+        assert typed.find_stop() is None, "nothing comes behind the end of the input"
+        await asyncio.sleep(0.1)
+        assert service.stops == ["M112 of a client"]
         typed.close()
 
     with os.fdopen(terminal) as stdin, contextlib.closing(os.fdopen(user, "rb", buffering=0)):

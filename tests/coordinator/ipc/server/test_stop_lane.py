@@ -47,7 +47,10 @@ class Lane(StopLane):
         self.early: list[str] = []
         """Found on new connections by the loop."""
         self._found = self.early
-        super().__init__(lambda who: self._found.append(who))
+        super().__init__(self._note)
+
+    def _note(self, who: str) -> None:
+        self._found.append(who)
 
     def look(self) -> None:
         self._found = self.stops
