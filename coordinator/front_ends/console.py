@@ -1,8 +1,10 @@
-"""What a service says on standard output: its log, and what it answers to lines that are typed."""
+"""What a service says on standard output and standard error: the loop does not wait until it is read."""
 
+import logging
 import os
 import select
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -13,7 +15,7 @@ END_S: Final = 1.0
 
 
 class Console:
-    """Writes to STREAM, standard output; None: there is none.
+    """Writes to STREAM, such as standard output; None: there is none.
 
     Where nobody reads it, because a pipe is full or Ctrl-S was pressed, lines wait, and what is too much is
     left out. Where it is closed, all of it is.
@@ -22,7 +24,7 @@ class Console:
     def __init__(self, stream: TextIO | None) -> None:
         self._fd = -1 if stream is None else stream.fileno()
         self._encoding = "utf-8" if stream is None else stream.encoding
-        self._thread = WritingThread("standard output", self._write, "nobody read them")
+        self._thread = WritingThread("console", self._write, "nobody read them")
 
     def show(self, text: str) -> None:
         """Write the lines of TEXT."""
@@ -43,3 +45,25 @@ class Console:
                     data = data[os.write(self._fd, data) :]
                 except BlockingIOError:  # another program may have it so that writing does not wait
                     select.select([], [self._fd], [])
+
+
+class _Reports(logging.Handler):
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._console.show(self.format(record))
+
+
+@contextmanager
+def asyncio_reports_to(console: Console) -> Iterator[None]:
+    """Have CONSOLE show what asyncio reports of bugs inside; by itself it writes to standard error."""
+    logger, handler = logging.getLogger("asyncio"), _Reports(console)
+    logger.addHandler(handler)
+    propagated, logger.propagate = logger.propagate, False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = propagated

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
-from coordinator.front_ends.console import Console
+from coordinator.front_ends.console import Console, asyncio_reports_to
 from coordinator.front_ends.log_file import ServiceLog
 from coordinator.front_ends.stop_path import StopPath
 from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
@@ -127,7 +127,7 @@ class _ServiceProcess:
         self._load = load
         self._options = options
         self._cache = cache
-        self._console = Console(sys.stdout)
+        self._console, self._errors = Console(sys.stdout), Console(sys.stderr)
         self._announcer: AnnouncerProcess | None = None
         self._gateway: Gateway | None = None
         self._terminal: PseudoTerminal | None = None
@@ -166,7 +166,9 @@ class _ServiceProcess:
         )
         page = self._page(registry, service)
         async with contextlib.AsyncExitStack() as stack:
-            stack.push_async_callback(asyncio.to_thread, self._console.close)
+            for console in (self._console, self._errors):
+                stack.push_async_callback(asyncio.to_thread, console.close)
+            stack.enter_context(asyncio_reports_to(self._errors))
             if self._options.log_file is not None:
                 self._log_file = ServiceLog(service, self._options.config, self._options.log_file)
                 stack.push_async_callback(self._log_file.close)

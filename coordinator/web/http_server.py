@@ -3,7 +3,6 @@
 import asyncio
 import functools
 import logging
-import ssl
 from collections.abc import Awaitable, Callable
 from typing import Final
 
@@ -11,6 +10,7 @@ from aiohttp import web
 
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.tcp_listener import TcpListener
+from coordinator.ipc.server.tls_transport import TlsServer
 
 SHUTDOWN_S: Final = 1.0
 """For requests that are being answered when the port is closed."""
@@ -39,7 +39,7 @@ class HttpServer:
         *,
         connections_max: int,
         connection_s: float,
-        context: ssl.SSLContext | None = None,
+        tls: TlsServer | None = None,
         stop_lane: StopLane | None = None,
         find_stop: FindStop = _nobody,
     ) -> None:
@@ -54,7 +54,7 @@ class HttpServer:
         self._aiohttp = web.Server(self._answer_once)
         self._listener = TcpListener(
             self._make_handler,
-            context,
+            tls,
             may_enter=self._may_enter,
             stop_lane=self._stop_lane,
             find_stop=find_stop,

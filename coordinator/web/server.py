@@ -17,7 +17,8 @@ from coordinator.ipc.protocol.limits import EndReason
 from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.server.auth import Grant, digest_of
 from coordinator.ipc.server.connection import Connection
-from coordinator.ipc.server.server import ExternalGrant, IpcServer, StopCall, tls_context
+from coordinator.ipc.server.server import ExternalGrant, IpcServer, StopCall
+from coordinator.ipc.server.tls_transport import TlsServer
 from coordinator.web.access import LINK_S, SESSION_S, PageAccess, PageSession, is_key_of
 from coordinator.web.files import PageFile, page_files
 from coordinator.web.http_server import HttpServer
@@ -98,14 +99,14 @@ class WebServer:
         """Open the port; raises CanductorError."""
         settings = self._settings
         await self._read_sessions()
-        context = None
+        tls = None
         if settings.certificate is not None and settings.private_key is not None:
-            context = await asyncio.to_thread(tls_context, settings.certificate, settings.private_key)
+            tls = await asyncio.to_thread(TlsServer, settings.certificate, settings.private_key)
         self._http = HttpServer(
             self._answer,
             connections_max=CONNECTIONS_MAX,
             connection_s=REQUEST_S,
-            context=context,
+            tls=tls,
             stop_lane=self._ipc.stop_lane,
             find_stop=functools.partial(self._find_stop, asyncio.get_running_loop()),
         )

@@ -22,16 +22,12 @@ from tests.stages.processes import (
     Command,
     Hardware,
     canductor,
+    own_port,
     write_gcode,
 )
 
 LIMIT_S = 60.0
 PIPE_BYTES = 1 << 16
-
-
-def own_port(number: int) -> int:
-    """Return a port of 127.0.0.1 that no other process of tests takes; none is given to clients by chance."""
-    return 10_000 + number + 10 * (os.getpid() % 2000)
 
 
 def until(client: BlockingClient, path: str, value: object) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -59,6 +60,11 @@ class Ended:
         assert len(lines) == 1, lines
         assert lines[0].startswith("canductor: ")
         return lines[0].removeprefix("canductor: ")
+
+
+def own_port(number: int) -> int:
+    """Return a port of 127.0.0.1 that no other process of tests takes; none is given to clients by chance."""
+    return 10_000 + number + 10 * (os.getpid() % 2000)
 
 
 class _Output:

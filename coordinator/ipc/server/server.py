@@ -3,12 +3,11 @@
 import asyncio
 import functools
 import socket
-import ssl
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.ipc.protocol.limits import EndReason, Limits
 from coordinator.ipc.protocol.messages import Encoder, Encoding
@@ -26,6 +25,9 @@ from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, TcpListener
 from coordinator.ipc.server.unix_socket import UnixListener, may_use, peer_of
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.ipc.server.tls_transport import TlsServer
 
 TOKENS_CHECK_S: Final = 1.0
 """Between looks at whether the tokens' file has changed."""
@@ -180,12 +182,12 @@ class IpcServer:
         await self._unix.open(path)
 
     async def _open_tcp(self, tcp: TcpSettings, scheduler: FairScheduler) -> None:
-        context = await asyncio.to_thread(_tls_of_tcp, tcp)
+        tls = await asyncio.to_thread(_tls_of_tcp, tcp)
         self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
         most = self._settings.tcp_connections_max
         listener = self._listener = TcpListener(
             lambda: Connection(self._admit_tcp, self._drop, scheduler),
-            context,
+            tls,
             handshakes_max=min(HANDSHAKES_MAX, most),
             may_enter=lambda entering: entering + len(self._tcp) < most + REFUSALS_MAX,
             stop_lane=self.stop_lane,
@@ -409,10 +411,12 @@ def _lockout_sentence(address: str, wait_s: float) -> str:
 # ------------------------------------------------------------------------------------------------- opening
 
 
-def _tls_of_tcp(tcp: TcpSettings) -> ssl.SSLContext | None:
+def _tls_of_tcp(tcp: TcpSettings) -> "TlsServer | None":
     """Return how TCP is kept secret, None for plain loopback; raises CanductorError."""
     if tcp.certificate is not None and tcp.private_key is not None:
-        return tls_context(tcp.certificate, tcp.private_key)
+        from coordinator.ipc.server.tls_transport import TlsServer  # noqa: PLC0415 (it takes OpenSSL)
+
+        return TlsServer(tcp.certificate, tcp.private_key)
     if not tcp.plain_on_loopback:
         raise CanductorError("TCP needs a certificate and its private key, or plain_on_loopback")
     if not _is_loopback(tcp.host):
@@ -420,17 +424,6 @@ def _tls_of_tcp(tcp: TcpSettings) -> ssl.SSLContext | None:
             f"TCP without TLS is for loopback only, and {tcp.host} is not: 127.0.0.1 or ::1 is"
         )
     return None
-
-
-def tls_context(certificate: Path, private_key: Path) -> ssl.SSLContext:
-    """Return TLS 1.2 or later with the chain and key of two PEM files; raises CanductorError."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    try:
-        context.load_cert_chain(certificate, private_key)
-    except (OSError, ssl.SSLError) as error:
-        raise CanductorError(f"the certificate {certificate} or its key cannot be used: {error}") from None
-    return context
 
 
 def _is_loopback(host: str) -> bool:

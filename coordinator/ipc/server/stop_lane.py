@@ -16,12 +16,18 @@ from asyncio.trsock import TransportSocket
 from collections.abc import Callable, Hashable
 from typing import Final
 
-from coordinator.ipc.server.tls_transport import TlsTransport
-
 FindStop = Callable[[bytes], str | None]
 """Returns who stops the machine with bytes that are unread; None: nobody does. In any thread."""
 Finder = Callable[[], str | None]
 PEEK_BYTES: Final = 262_144
+
+
+class PeekedTransport(asyncio.Transport):
+    """A transport in whose socket nobody finds what the client has sent: TLS."""
+
+    def find_in(self, find: FindStop) -> str | None:
+        """Return what FIND finds in what the client has sent and nobody has taken; in any thread."""
+        raise NotImplementedError
 
 
 def _ignore(_: str) -> None:
@@ -57,7 +63,7 @@ class StopLane:
         opened = None if transport is None else transport.get_extra_info("socket")
         if opened is None:
             return
-        if isinstance(transport, TlsTransport):
+        if isinstance(transport, PeekedTransport):
             self.watch_with(key, opened, functools.partial(transport.find_in, find_stop))
         else:
             self.watch(key, opened, find_stop)

@@ -8,14 +8,15 @@ import asyncio
 import functools
 import resource
 import socket
-import ssl
 from collections import Counter
 from collections.abc import Callable
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from coordinator.ipc.server.acceptor import Acceptor, Arrival
 from coordinator.ipc.server.stop_lane import StopLane, find_unread
-from coordinator.ipc.server.tls_transport import TlsState, serve_tls
+
+if TYPE_CHECKING:  # it takes OpenSSL
+    from coordinator.ipc.server.tls_transport import TlsServer, TlsState
 
 HANDSHAKES_MAX: Final = 128
 """TLS handshakes at a time; for one more, the oldest of the address that has most of them is closed."""
@@ -33,7 +34,7 @@ def _nobody(_: str, _unread: bytes) -> None:
 
 
 class TcpListener:
-    """A TCP port, with TLS where there is a CONTEXT. MAKE_PROTOCOL makes the protocol of each connection.
+    """A TCP port, with TLS unless that is None. MAKE_PROTOCOL makes the protocol of each connection.
 
     MAY_ENTER gets how many connections are being set up, and returns whether there may be one more.
     STOP_LANE finds stops while the loop is held; FIND_STOP gets an address, and what came from there.
@@ -42,7 +43,7 @@ class TcpListener:
     def __init__(
         self,
         make_protocol: Callable[[], asyncio.BaseProtocol],
-        context: ssl.SSLContext | None,
+        tls: "TlsServer | None",
         *,
         handshakes_max: int = HANDSHAKES_MAX,
         may_enter: Callable[[int], bool] = _always,
@@ -50,7 +51,7 @@ class TcpListener:
         find_stop: Callable[[str, bytes], str | None] = _nobody,
     ) -> None:
         self._make_protocol = make_protocol
-        self._context = context
+        self._tls = tls
         self._handshakes_max = handshakes_max
         self._may_enter = may_enter
         self._stop_lane = stop_lane or StopLane()
@@ -101,7 +102,7 @@ class TcpListener:
         """Return how to look for a stop in what OPENED sends, and to serve it; in any thread."""
         address = _address_of(opened)
         find_stop = functools.partial(self._find_stop, address)
-        tls = None if self._context is None else TlsState(opened.dup(), self._context)
+        tls = None if self._tls is None else self._tls.begin(opened.dup())
         find = functools.partial(find_unread, opened) if tls is None else tls.find_in
         return Arrival(
             opened,
@@ -110,8 +111,8 @@ class TcpListener:
             functools.partial(self._give_up, opened, tls),
         )
 
-    def _take(self, opened: socket.socket, address: str, tls: TlsState | None) -> None:
-        if self._context is not None and len(self._entering) >= self._handshakes_max:
+    def _take(self, opened: socket.socket, address: str, tls: "TlsState | None") -> None:
+        if self._tls is not None and len(self._entering) >= self._handshakes_max:
             self._make_room()
         if not self._may_enter(len(self._entering)):
             self.refused += 1
@@ -130,20 +131,20 @@ class TcpListener:
         oldest.cancel()
         self.refused += 1
 
-    async def _enter(self, opened: socket.socket, tls: TlsState | None) -> None:
-        if tls is None or self._context is None:
+    async def _enter(self, opened: socket.socket, tls: "TlsState | None") -> None:
+        if tls is None:
             await asyncio.get_running_loop().connect_accepted_socket(self._make_protocol, opened)
         else:
-            await serve_tls(self._make_protocol, opened, self._context, HANDSHAKE_S, tls)
+            await tls.serve(self._make_protocol, opened, HANDSHAKE_S)
 
-    def _end_entering(self, opened: socket.socket, tls: TlsState | None, task: asyncio.Task[None]) -> None:
+    def _end_entering(self, opened: socket.socket, tls: "TlsState | None", task: asyncio.Task[None]) -> None:
         self._entering.pop(task, None)
         self._stop_lane.settle(opened)
         if task.cancelled() or isinstance(task.exception(), OSError):  # no TLS, not in time, or gone
             self._give_up(opened, tls)
 
     @staticmethod
-    def _give_up(opened: socket.socket, tls: TlsState | None) -> None:
+    def _give_up(opened: socket.socket, tls: "TlsState | None") -> None:
         opened.close()
         if tls is not None:
             tls.release()

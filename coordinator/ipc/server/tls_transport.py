@@ -10,7 +10,11 @@ import socket
 import ssl
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Final
+
+from coordinator.ipc.server.stop_lane import FindStop, PeekedTransport
+from nodes.support.errors import CanductorError
 
 READ_BYTES: Final = 65_536
 WAITING_MAX: Final = 262_144
@@ -21,10 +25,29 @@ def _nothing() -> None:
     pass
 
 
+class TlsServer:
+    """TLS 1.2 or later with the chain and key of two PEM files; raises CanductorError."""
+
+    def __init__(self, certificate: Path, private_key: Path) -> None:
+        self._context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        self._context.minimum_version = ssl.TLSVersion.TLSv1_2
+        try:
+            self._context.load_cert_chain(certificate, private_key)
+        except (OSError, ssl.SSLError) as error:
+            raise CanductorError(
+                f"the certificate {certificate} or its key cannot be used: {error}"
+            ) from None
+
+    def begin(self, opened: socket.socket) -> "TlsState":
+        """Return the state of TLS over OPENED, a non-blocking socket of its own."""
+        return TlsState(opened, self._context)
+
+
 class TlsState:
     """The server's end of a TLS connection over OPENED, a non-blocking socket of its own; for any thread."""
 
     def __init__(self, opened: socket.socket, context: ssl.SSLContext) -> None:
+        self.context = context
         self.socket = opened
         self._lock = threading.RLock()
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -39,12 +62,32 @@ class TlsState:
         self._raw: asyncio.Transport | None = None
         self._on_news = _nothing
 
+    async def serve(
+        self,
+        make_protocol: Callable[[], asyncio.BaseProtocol],
+        opened: socket.socket,
+        handshake_s: float,
+    ) -> None:
+        """Have the running loop serve OPENED, accepted; return when the handshake is done, in HANDSHAKE_S.
+
+        Raises OSError, TimeoutError included, with the connection closed.
+        """
+        loop = asyncio.get_running_loop()
+        transport = TlsTransport(loop, self, make_protocol)
+        raw, _ = await loop.connect_accepted_socket(lambda: _Carrier(transport), opened)
+        try:
+            async with asyncio.timeout(handshake_s):
+                await transport.ready
+        except BaseException:
+            raw.abort()
+            raise
+
     def carried_by(self, raw: asyncio.Transport, on_news: Callable[[], None]) -> None:
         """Have RAW send, from now on; ON_NEWS is called when ``find_in`` has taken something."""
         with self._lock:
             self._raw, self._on_news = raw, on_news
 
-    def find_in(self, find: Callable[[bytes], str | None]) -> str | None:
+    def find_in(self, find: FindStop) -> str | None:
         """Read from the socket and return FIND of the decrypted bytes that were not taken yet; in any thread.
 
         A handshake that is under way is continued.
@@ -138,7 +181,7 @@ class TlsState:
                 self._raw.write(data)
 
 
-class TlsTransport(asyncio.Transport):
+class TlsTransport(PeekedTransport):
     """Carries PROTOCOL over TLS, once the handshake is done; ``ready`` is set then, or has its error."""
 
     def __init__(
@@ -146,7 +189,6 @@ class TlsTransport(asyncio.Transport):
         loop: asyncio.AbstractEventLoop,
         state: TlsState,
         make_protocol: Callable[[], asyncio.BaseProtocol],
-        context: ssl.SSLContext,
     ) -> None:
         super().__init__()
         self.ready: asyncio.Future[None] = loop.create_future()
@@ -154,14 +196,13 @@ class TlsTransport(asyncio.Transport):
         self._state = state
         self._make_protocol = make_protocol
         self._protocol: asyncio.BaseProtocol | None = None
-        self._context = context
         self._raw: asyncio.Transport
         self._paused = False
         self._closing = False
 
     # ------------------------------------------------------------------------------- beside the loop
 
-    def find_in(self, find: Callable[[bytes], str | None]) -> str | None:
+    def find_in(self, find: FindStop) -> str | None:
         """Return what FIND finds in what the client has sent and nobody has taken; in any thread."""
         return self._state.find_in(find)
 
@@ -218,7 +259,7 @@ class TlsTransport(asyncio.Transport):
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
         """Return what is known of the connection, as of any other."""
-        return self._context if name == "sslcontext" else self._raw.get_extra_info(name, default)
+        return self._state.context if name == "sslcontext" else self._raw.get_extra_info(name, default)
 
     def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
         """Carry PROTOCOL from now on."""
@@ -313,29 +354,6 @@ class _Carrier(asyncio.Protocol):
     def resume_writing(self) -> None:
         if self._transport.ready.done():
             self._transport.get_protocol().resume_writing()
-
-
-async def serve_tls(
-    make_protocol: Callable[[], asyncio.BaseProtocol],
-    opened: socket.socket,
-    context: ssl.SSLContext,
-    handshake_s: float,
-    state: TlsState,
-) -> None:
-    """Have the running loop serve OPENED, accepted; return when the handshake is done, in HANDSHAKE_S.
-
-    STATE is that of TLS, with a socket of its own. Raises OSError, TimeoutError included, with the connection
-    closed.
-    """
-    loop = asyncio.get_running_loop()
-    transport = TlsTransport(loop, state, make_protocol, context)
-    raw, _ = await loop.connect_accepted_socket(lambda: _Carrier(transport), opened)
-    try:
-        async with asyncio.timeout(handshake_s):
-            await transport.ready
-    except BaseException:
-        raw.abort()
-        raise
 
 
 def _hand_over(protocol: asyncio.BaseProtocol, data: bytes) -> None:

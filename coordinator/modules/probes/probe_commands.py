@@ -1,6 +1,8 @@
 """PROBE, QUERY_PROBE, PROBE_ACCURACY, PROBE_CALIBRATE, Z_OFFSET_APPLY_PROBE: for whatever probe there is."""
 
+import statistics
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Final
 
 from coordinator.config.options import SectionSpec
@@ -19,7 +21,6 @@ from coordinator.gcode.parameters import bounded
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.probes.manual_probe import SPEED, ManualProbe
 from coordinator.modules.probes.probe import Measuring, Probe, lift
-from coordinator.modules.probes.samples import Accuracy
 from coordinator.runtime.module_context import ModuleContext
 from nodes.support.errors import CanductorError
 
@@ -171,3 +172,18 @@ class ProbeCommands(Module):
             raise CanductorError("the z_offset of the probe needs a machine that is connected")
         self._live.save(self.probe.name, "z_offset", f"{z_offset:.3f}")
         return (f"{self.probe.name}: z_offset: {z_offset:.3f}; SAVE_CONFIG writes it and restarts",)
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """What repeated measurements of one place say about a probe, mm."""
+
+    heights: tuple[float, ...]
+
+    def __str__(self) -> str:
+        heights = self.heights
+        return (
+            f"probe accuracy results: maximum {max(heights):.6f}, minimum {min(heights):.6f}, range"
+            f" {max(heights) - min(heights):.6f}, average {statistics.fmean(heights):.6f}, median"
+            f" {statistics.median(heights):.6f}, standard deviation {statistics.pstdev(heights):.6f}"
+        )

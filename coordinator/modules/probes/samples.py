@@ -1,6 +1,6 @@
 """How several measurements of one place become one height: pure, and the same for every probe."""
 
-import statistics
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -76,19 +76,7 @@ class SampleSeries:
 
 def combined(heights: list[float], result: str) -> float:
     """Return the average or the median of HEIGHTS, of which there is one at least."""
-    return statistics.median(heights) if result == MEDIAN else statistics.fmean(heights)
-
-
-@dataclass(frozen=True, slots=True)
-class Accuracy:
-    """What repeated measurements of one place say about a probe, mm."""
-
-    heights: tuple[float, ...]
-
-    def __str__(self) -> str:
-        heights = self.heights
-        return (
-            f"probe accuracy results: maximum {max(heights):.6f}, minimum {min(heights):.6f}, range"
-            f" {max(heights) - min(heights):.6f}, average {statistics.fmean(heights):.6f}, median"
-            f" {statistics.median(heights):.6f}, standard deviation {statistics.pstdev(heights):.6f}"
-        )
+    if result != MEDIAN:
+        return math.fsum(heights) / len(heights)
+    ordered, half = sorted(heights), len(heights) // 2
+    return (ordered[half] + ordered[~half]) / 2

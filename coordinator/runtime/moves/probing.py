@@ -5,7 +5,7 @@ how far the head went on afterwards does not matter.
 """
 
 import asyncio
-import statistics
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -156,11 +156,12 @@ class SlowLift:
         self.begin_s, self.end_s = move.begin_s, move.end_s
         await move.run()
         after = await self._machine.query_stepper_counts()
-        return statistics.fmean(
+        ways = [
             (after[motor.name] - before[motor.name]) * motor.step_distance / self._ways[motor.name]
             for motor in self._machine.description.motors
             if motor.name in self._ways
-        )
+        ]
+        return math.fsum(ways) / len(ways)
 
     def way_at(self, print_time: float) -> float:
         """Return how far up it is at a print time, mm."""

@@ -1,5 +1,6 @@
 """Standard output of a service, where nobody reads it, or where it is closed."""
 
+import asyncio
 import os
 import select
 from collections.abc import Iterator
@@ -8,7 +9,7 @@ from typing import TextIO
 
 import pytest
 
-from coordinator.front_ends.console import Console
+from coordinator.front_ends.console import Console, asyncio_reports_to
 from coordinator.front_ends.writing_thread import WAITING_MAX
 
 PIPE_BYTES_MAX = 1 << 20
@@ -70,3 +71,27 @@ def test_a_closed_output_is_no_mistake(tmp_path: Path) -> None:
     console = Console(None)
     console.show("there is none")
     console.close()
+
+
+def test_a_report_of_a_bug_does_not_hold_the_loop(pipe: tuple[int, TextIO]) -> None:
+    """asyncio would write it to standard error itself, and wait where nobody reads that."""
+    reads, stream = pipe
+    console, text = Console(stream), "x" * PIPE_BYTES_MAX
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        for _ in range(3):
+            loop.call_soon(_fail, text)
+            await asyncio.sleep(0)
+
+    with asyncio_reports_to(console):
+        asyncio.run(main())
+    seen = b""
+    while seen.count(b"ZeroDivisionError") < 3:
+        seen += os.read(reads, 1 << 16)
+    assert b"Exception in callback _fail(" in seen
+    console.close()
+
+
+def _fail(_: str) -> None:
+    raise ZeroDivisionError

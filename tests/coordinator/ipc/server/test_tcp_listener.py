@@ -13,7 +13,6 @@ import pytest
 
 from coordinator.ipc.client.client import Client
 from coordinator.ipc.protocol.methods import Scope
-from coordinator.ipc.server.server import tls_context
 from coordinator.ipc.server.settings import TcpSettings
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.tcp_listener import (
@@ -23,6 +22,7 @@ from coordinator.ipc.server.tcp_listener import (
     TcpListener,
     raise_files_limit,
 )
+from coordinator.ipc.server.tls_transport import TlsServer
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, run
 from tests.stages import jump_loop
 
@@ -135,11 +135,11 @@ def test_what_nobody_looks_at_is_not_kept(certificate: tuple[Path, Path]) -> Non
             def connection_made(self, transport: asyncio.BaseTransport) -> None:
                 come.put_nowait(None)
 
-        for context in (None, tls_context(*certificate)):
+        for tls in (None, TlsServer(*certificate)):
             lane = StopLane()
-            listener = TcpListener(Guest, context, stop_lane=lane)
+            listener = TcpListener(Guest, tls, stop_lane=lane)
             await listener.open("127.0.0.1", 0)
-            trusting = None if context is None else ssl.create_default_context(cafile=str(certificate[0]))
+            trusting = None if tls is None else ssl.create_default_context(cafile=str(certificate[0]))
             _, writer = await asyncio.open_connection(*listener.addresses[0], ssl=trusting)
             await come.get()
             async with asyncio.timeout(30):

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.server.server import tls_context
 from coordinator.ipc.server.tcp_listener import TcpListener
-from coordinator.ipc.server.tls_transport import TlsTransport
+from coordinator.ipc.server.tls_transport import TlsServer, TlsTransport
 from tests.stages import jump_loop
 
 MIB = 1 << 20
@@ -78,7 +77,7 @@ def run(certificate: tuple[Path, Path], body: Body) -> None:
             guests.append(Guest())
             return guests[-1]
 
-        listener = TcpListener(make, tls_context(*certificate))
+        listener = TcpListener(make, TlsServer(*certificate))
         await listener.open("127.0.0.1", 0)
         trusting = ssl.create_default_context(cafile=str(certificate[0]))
         reader, writer = await asyncio.open_connection(*listener.addresses[0], ssl=trusting)

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.modules.probes.samples import Accuracy, SampleRules, SampleSeries, combined
+from coordinator.modules.probes.probe_commands import Accuracy
+from coordinator.modules.probes.samples import SampleRules, SampleSeries, combined
 
 HEIGHTS = st.lists(st.floats(-5, 5), min_size=1, max_size=9)
 
