@@ -4,10 +4,15 @@
 
 #include "nodes/link/core/batch.h"
 
-enum { STAMP = sizeof(uint64_t) };
+enum { STAMP = sizeof(uint64_t), FIRST_ROOM = 4096 };
 
 void link_queue_init(struct link_queue *queue, uint8_t *memory, size_t size, int stamped) {
-    *queue = (struct link_queue){.memory = memory, .size = size, .stamped = stamped ? 1 : 0};
+    *queue = (struct link_queue){
+        .memory = memory,
+        .size = size,
+        .room = size < FIRST_ROOM ? size : FIRST_ROOM,
+        .stamped = stamped ? 1 : 0,
+    };
 }
 
 static size_t header_of(const struct link_queue *queue) {
@@ -16,12 +21,12 @@ static size_t header_of(const struct link_queue *queue) {
 
 // Where what was put AT this count of bytes begins in memory.
 static size_t start_of(const struct link_queue *queue, uint64_t at) {
-    return (size_t)(at & (queue->size - 1));
+    return (size_t)(at & (queue->room - 1));
 }
 
 static size_t up_to_the_end(const struct link_queue *queue, size_t start, size_t size) {
-    size_t room = (size_t)queue->size - start;
-    return size < room ? size : room;
+    size_t left = (size_t)queue->room - start;
+    return size < left ? size : left;
 }
 
 static void copy_in(struct link_queue *queue, uint64_t at, const uint8_t *from, size_t size) {
@@ -36,9 +41,28 @@ static void copy_out(const struct link_queue *queue, uint64_t at, uint8_t *to, s
     memcpy(to + first, queue->memory, size - first);
 }
 
+// Doubles the room. What lies in every other stretch of that length has its place in the new half.
+static void grow(struct link_queue *queue) {
+    uint64_t room = queue->room, stretch = queue->tail & ~(room - 1);
+    uint64_t from = stretch, to = queue->tail;
+    if (!(stretch & room)) { // the one before it moves, as far as it is queued
+        from = queue->head;
+        to = stretch;
+    }
+    if (from < queue->head)
+        from = queue->head;
+    if (from < to) {
+        size_t start = start_of(queue, from);
+        memcpy(queue->memory + room + start, queue->memory + start, (size_t)(to - from));
+    }
+    queue->room = 2 * room;
+}
+
 int link_queue_put(struct link_queue *queue, const uint8_t *batch, size_t size, uint64_t count) {
     if (size > queue->size - link_queue_bytes(queue))
         return 0;
+    while (size > queue->room - link_queue_bytes(queue))
+        grow(queue);
     copy_in(queue, queue->tail, batch, size);
     queue->tail += size;
     queue->commands += count;
@@ -63,7 +87,7 @@ int link_queue_put_stamped(struct link_queue *queue, const struct link_command *
 uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct link_command *out) {
     uint8_t header[BATCH_HEADER + STAMP]; // a fixed size, for speed: executed for every command
     size_t start = start_of(queue, at);
-    if (queue->size - start >= sizeof header)
+    if (queue->room - start >= sizeof header)
         memcpy(header, queue->memory + start, sizeof header);
     else
         copy_out(queue, at, header, sizeof header);

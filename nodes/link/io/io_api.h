@@ -45,7 +45,7 @@
 //
 //     io_send, io_send_urgent     the command's size, L, and what the driver's kick sends at once
 //     io_send_batch               the batch's size (it is checked, copied, noted for the forecast), L, and
-//                                 what the kick sends
+//                                 what the kick sends; when a queue is longer than ever, a copy of it
 //     io_take                     the room given
 //     io_received                 the bytes moved
 //     io_next                     for each frame written, all L links, each of which examines no more

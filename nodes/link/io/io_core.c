@@ -155,6 +155,8 @@ static size_t take_ring(struct io_ring *ring, struct io_event *out, size_t room)
         out[taken] = ring->events[ring->first];
         ring->first = (ring->first + 1) % ring->size;
     }
+    if (!ring->count)
+        ring->first = 0; // it goes through no more of its memory than was ever taken
     return taken;
 }
 

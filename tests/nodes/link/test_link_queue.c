@@ -106,7 +106,50 @@ static void the_longest_record_is_whole(void) {
     free(queue.memory);
 }
 
+// The rest of the memory is poisoned: a queue that stays short has not touched it.
+static void it_uses_no_more_memory_than_it_needs(void) {
+    enum { BIG = 1 << 16, ROOM = 4096 };
+    struct link_queue queue = open_with(0, BIG);
+    for (uint64_t number = 1; number <= 5000; number++) {
+        CHECK(put(&queue, (uint8_t)(number % 250), number));
+        if (number > 9)
+            check_first(&queue, (uint8_t)((number - 9) % 250), number - 9);
+    }
+    CHECK_EQUAL(queue.room, ROOM);
+    for (unsigned i = ROOM; i < BIG; i++)
+        CHECK_EQUAL(queue.memory[i], 1);
+    free(queue.memory);
+}
+
+// From every place in the ring, with both stretches and with one: all that waits is whole, in its order.
+static void it_grows_from_everywhere(void) {
+    enum { BIG = 1 << 16, ROOM = 4096, RECORD = BATCH_HEADER + 100 };
+    for (uint64_t start = 0; start < 4 * ROOM; start += 7) {
+        struct link_queue queue = open_with(0, BIG);
+        uint8_t filler[ROOM] = {0};
+        for (uint64_t at = 0, size; at < start; at += size) {
+            size = start - at < ROOM ? start - at : ROOM;
+            CHECK_EQUAL(link_queue_put(&queue, filler, (size_t)size, 1), 1);
+            link_queue_drop(&queue, queue.tail, 1);
+        }
+        CHECK_EQUAL(queue.room, ROOM);
+        uint64_t put_in = 0, taken = 0;
+        while (link_queue_bytes(&queue) + RECORD <= BIG) {
+            CHECK(put(&queue, 100, ++put_in));
+            if (put_in % 5 == 0)
+                check_first(&queue, 100, ++taken);
+        }
+        CHECK_EQUAL(queue.room, BIG);
+        while (taken < put_in)
+            check_first(&queue, 100, ++taken);
+        CHECK_EQUAL(link_queue_bytes(&queue), 0);
+        free(queue.memory);
+    }
+}
+
 int main(void) {
+    it_uses_no_more_memory_than_it_needs();
+    it_grows_from_everywhere();
     the_longest_record_is_whole();
     records_survive_every_wrap(0);
     records_survive_every_wrap(1);
