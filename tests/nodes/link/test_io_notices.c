@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "nodes/link/io/io_api.h"
+#include "nodes/link/io/io_bus.h"
 #include "tests/check.h"
 
 #define MS 1000000ULL
@@ -185,6 +186,24 @@ static void a_full_ring_drops_what_is_oldest(void) {
     io_free(scene.bus);
 }
 
+// However much comes in all, a ring that is emptied touches no more of its memory than waited at once.
+static void a_ring_that_is_emptied_begins_again(void) {
+    struct scene scene;
+    struct io_event events[3];
+    begin(&scene);
+    for (unsigned i = 0; i < 2 * IO_FRAMES_MAX; i++) {
+        number_comes(&scene, i);
+        number_comes(&scene, i + 1);
+        CHECK_EQUAL(io_take(scene.bus, events, 1), 1);
+        CHECK_EQUAL(io_take(scene.bus, events + 1, 2), 1);
+        CHECK_EQUAL(events[0].content[0], i % 256);
+        CHECK_EQUAL(events[1].content[0], (i + 1) % 256);
+    }
+    CHECK(scene.bus->unclaimed.events[1].size);
+    CHECK_EQUAL(scene.bus->unclaimed.events[2].size, 0);
+    io_free(scene.bus);
+}
+
 // Of nothing older than what was handed over, though the round has not ended.
 static void counters_keep_up_with_what_is_taken(void) {
     struct scene scene;
@@ -243,6 +262,7 @@ static void what_was_held_back_is_due_once(void) {
 int main(void) {
     notices_come_in_order_whatever_room_there_is();
     a_drained_link_is_told_of_once_when_it_is();
+    a_ring_that_is_emptied_begins_again();
     a_full_ring_drops_what_is_oldest();
     counters_keep_up_with_what_is_taken();
     time_acts_on_every_link();
