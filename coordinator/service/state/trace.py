@@ -28,6 +28,8 @@ MOVES_MAX: Final = 20_000
 PIECE_MOVES: Final = 256
 FRESH_MAX: Final = 256
 """Batches of moves that wait for ``take_fresh``."""
+BATCHES_KEEP_S: Final = KEEP_S + 2.0
+"""Commands are sent up to 1.2 s before they are due."""
 BATCH_BYTES_MAX: Final = 1 << 20
 """Per node."""
 
@@ -63,7 +65,8 @@ class MotionTrace:
     def __init__(self, nodes: int) -> None:
         self._pieces: tuple[bytes, ...] = ()
         """Moves, each piece with at least one."""
-        self._batches: list[deque[bytes]] = [deque() for _ in range(nodes)]
+        self._batches: list[deque[tuple[float, bytes]]] = [deque() for _ in range(nodes)]
+        """With ``forget_before_s`` when they were sent."""
         self._batch_bytes = [0] * nodes
         self._batches_seen = [0] * nodes
         self.sent = Sent()
@@ -92,11 +95,14 @@ class MotionTrace:
         """Keep the newest commands of each node, and what all commands add up to."""
         for node, batch in batches:
             kept = self._batches[node]
-            kept.append(batch)
+            kept.append((self.forget_before_s, batch))
             self._batches_seen[node] += 1
             self._batch_bytes[node] += len(batch)
-            while len(kept) > 1 and self._batch_bytes[node] > BATCH_BYTES_MAX:
-                self._batch_bytes[node] -= len(kept.popleft())
+            while len(kept) > 1 and (
+                kept[0][0] < self.forget_before_s - BATCHES_KEEP_S
+                or self._batch_bytes[node] > BATCH_BYTES_MAX
+            ):
+                self._batch_bytes[node] -= len(kept.popleft()[1])
         self.sent = Sent(planned.steps_sent, planned.last_step_clocks)
 
     # --------------------------------------------------------------------------------------- to look at
@@ -142,12 +148,12 @@ class MotionTrace:
 
     def batches(self, node: int) -> tuple[bytes, ...]:
         """Return what was sent to a moving node, oldest first."""
-        return tuple(self._batches[node])
+        return tuple(batch for _, batch in self._batches[node])
 
     def batches_after(self, node: int, seen: int) -> tuple[int, tuple[bytes, ...]]:
         """Return how many batches a node has got, and of those beyond the first SEEN what is still kept."""
         total, kept = self._batches_seen[node], self._batches[node]
-        return total, tuple(islice(kept, max(0, len(kept) - (total - seen)), None))
+        return total, tuple(batch for _, batch in islice(kept, max(0, len(kept) - (total - seen)), None))
 
 
 def _moment(move: Move, print_time: float) -> Moment:

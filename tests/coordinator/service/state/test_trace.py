@@ -9,7 +9,14 @@ from coordinator.assembly.load import load_machine
 from coordinator.motion.moves import read_moves
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.core.motion import UNMOVED
-from coordinator.service.state.trace import BATCH_BYTES_MAX, MOVES_MAX, MotionTrace, Sent
+from coordinator.service.state.trace import (
+    BATCH_BYTES_MAX,
+    BATCHES_KEEP_S,
+    KEEP_S,
+    MOVES_MAX,
+    MotionTrace,
+    Sent,
+)
 from coordinator.support.examples import DEMO_MACHINE
 
 
@@ -84,6 +91,21 @@ def test_memory_is_bounded_and_the_newest_stays() -> None:
     assert (total, [batch[0] for batch in newest]) == (100, [97, 98, 99])
     assert [batch[0] for batch in trace.batches_after(0, 0)[1]] == list(range(90, 100)), "what is kept"
     assert trace.batches_after(0, 100) == (100, ())
+
+
+def test_commands_of_long_ago_are_forgotten() -> None:
+    """Failed before: up to a megabyte of them was kept for each node."""
+    trace = MotionTrace(2)
+    for now_s in range(100):
+        trace.forget_before_s = now_s - KEEP_S
+        trace.see_sent([(0, bytes((now_s,)))], UNMOVED)
+        if now_s == 0:
+            trace.see_sent([(1, b"long ago")], UNMOVED)
+    kept = [batch[0] for batch in trace.batches(0)]
+    assert kept == list(range(99 - round(BATCHES_KEEP_S), 100))
+    assert trace.batches_after(0, 98) == (100, (b"\x62", b"\x63"))
+    assert trace.batches_after(0, 0)[1] == trace.batches(0)
+    assert trace.batches(1) == (b"long ago",), "the last one stays: a node that rests is asked about, too"
 
 
 def test_only_the_stretch_that_is_asked_for() -> None:
