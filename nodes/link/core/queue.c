@@ -49,8 +49,6 @@ static void grow(struct link_queue *queue) {
         from = queue->head;
         to = stretch;
     }
-    if (from < queue->head)
-        from = queue->head;
     if (from < to) {
         size_t start = start_of(queue, from);
         memcpy(queue->memory + room + start, queue->memory + start, (size_t)(to - from));

@@ -124,7 +124,7 @@ static void it_uses_no_more_memory_than_it_needs(void) {
 // From every place in the ring, with both stretches and with one: all that waits is whole, in its order.
 static void it_grows_from_everywhere(void) {
     enum { BIG = 1 << 16, ROOM = 4096, RECORD = BATCH_HEADER + 100 };
-    for (uint64_t start = 0; start < 4 * ROOM; start += 7) {
+    for (uint64_t start = 0; start < 2 * BIG; start += start < 4 * ROOM ? 7 : 1021) {
         struct link_queue queue = open_with(0, BIG);
         uint8_t filler[ROOM] = {0};
         for (uint64_t at = 0, size; at < start; at += size) {
