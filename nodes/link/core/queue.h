@@ -9,9 +9,9 @@
 #include "wire/wire.h"
 
 // cffi: begin
-// Positions count bytes since the start and never wrap; SIZE is a power of two. The ring goes around the first
-// ROOM bytes of the memory, a power of two as well, which doubles when a record does not fit: most queues stay
-// short, and memory that was never touched takes no room.
+// Positions count bytes since the start and never wrap; SIZE is a power of two. The ring goes around the
+// first ROOM bytes of the memory, a power of two as well, which doubles when a record does not fit: most
+// queues stay short, and memory that was never touched takes no room.
 struct link_queue {
     uint8_t *memory;
     uint64_t size, room, head, tail;
