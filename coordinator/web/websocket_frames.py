@@ -1,4 +1,4 @@
-"""Reads the frames of a WebSocket beside the server that carries them; RFC 6455, as far as browsers do."""
+"""A second reader of a WebSocket's frames, for the stop lane; RFC 6455, as far as browsers use it."""
 
 import struct
 from collections import deque

@@ -22,8 +22,8 @@ Finder = Callable[[], str | None]
 PEEK_BYTES: Final = 262_144
 
 
-class PeekedTransport(asyncio.Transport):
-    """A transport in whose socket nobody finds what the client has sent: TLS."""
+class EncryptedTransport(asyncio.Transport):
+    """A transport whose socket has only encrypted bytes: a stop is found where they are decrypted."""
 
     def find_in(self, find: FindStop) -> str | None:
         """Return what FIND finds in what the client has sent and nobody has taken; in any thread."""
@@ -63,7 +63,7 @@ class StopLane:
         opened = None if transport is None else transport.get_extra_info("socket")
         if opened is None:
             return
-        if isinstance(transport, PeekedTransport):
+        if isinstance(transport, EncryptedTransport):
             self.watch_with(key, opened, functools.partial(transport.find_in, find_stop))
         else:
             self.watch(key, opened, find_stop)
@@ -110,13 +110,13 @@ class StopLane:
             self._finders.clear()
 
     def look_at_new(self, opened: socket.socket) -> bool:
-        """Look at OPENED, just accepted; return whether it is new still."""
+        """Look at OPENED, just accepted; return whether to look again: it is new still, and stops nothing."""
         with self._lock:
             find = self._new.get(opened)
             who = None if find is None else find()
         if who is not None:
             self._stop(who)
-        return find is not None
+        return find is not None and who is None
 
     def find(self) -> str | None:
         """Return who stops the machine with what is unread; None: nobody. Stops nothing."""

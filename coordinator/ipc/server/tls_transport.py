@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.ipc.server.stop_lane import FindStop, PeekedTransport
+from coordinator.ipc.server.stop_lane import EncryptedTransport, FindStop
 from nodes.support.errors import CanductorError
 
 READ_BYTES: Final = 65_536
@@ -181,7 +181,7 @@ class TlsState:
                 self._raw.write(data)
 
 
-class TlsTransport(PeekedTransport):
+class TlsTransport(EncryptedTransport):
     """Carries PROTOCOL over TLS, once the handshake is done; ``ready`` is set then, or has its error."""
 
     def __init__(

@@ -55,7 +55,7 @@ def test_a_machine_that_began_during_a_look_is_not_stopped() -> None:
 
         path.lane.look_also(find)
         look(path)
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0)
         assert after.stopped is None
         path.close()
 
@@ -74,11 +74,11 @@ def test_a_machine_that_begins_before_the_stop_is_entered_is_not_stopped() -> No
         path.lane.look_also(lambda: "me")
         look(path)
         service.machine = after
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0)
         assert after.stopped is None
         service.machine = before
         look(path)
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0)
         assert before.stopped is None, "it was done already"
         path.close()
 
@@ -94,7 +94,7 @@ def test_the_machine_is_stopped_for_who_is_found() -> None:
         path.lane.look_also(lambda: "me")
         look(path)
         assert machine.stopped is None, "the loop enters it, when it can"
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0)
         assert str(machine.stopped) == "emergency stop by me"
         path.close()
 

@@ -1,4 +1,4 @@
-"""Messages of a WebSocket are read beside the server that carries them."""
+"""The second reader of a WebSocket's frames finds the messages that were not handed on."""
 
 import bisect
 import itertools
