@@ -13,6 +13,7 @@ export class Job {
   #state = "none";
   #sure = 0; // timer
   #pictured = ""; // the file whose picture is shown
+  #arrived = ""; // the file to choose when it is in the list
   #asked_to_cancel = false;
 
   /** HEAT: the temperatures; ON_END is called when a job has ended. */
@@ -20,7 +21,10 @@ export class Job {
     this.#link = link;
     this.heat = heat;
     this.on_end = on_end;
-    $("job-files").addEventListener("change", () => this.#picture($("job-files").value));
+    $("job-files").addEventListener("change", () => {
+      this.#arrived = ""; // a person has chosen
+      this.#picture($("job-files").value);
+    });
     $("heat-leave").addEventListener("click", () => show($("still-hot"), false));
     $("heat-end").addEventListener("click", () => {
       this.heat.turn_off();
@@ -61,9 +65,11 @@ export class Job {
     if (!ACTIVE.has(this.#state)) this.#picture(select.value);
   }
 
-  /** Show the list with FILE chosen: it has just arrived. */
+  /** Show the list with FILE chosen, which has just arrived, unless another one is chosen meanwhile. */
   async choose(file) {
+    this.#arrived = file;
     await this.list();
+    if (file !== this.#arrived) return;
     $("job-files").value = file;
     this.#picture(file);
   }

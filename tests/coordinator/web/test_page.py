@@ -587,6 +587,40 @@ def test_a_print_from_start_to_stop(browser: Browser, machine: Demo) -> None:
     tab.close(UNREACHED, WEBSOCKET_REFUSED)
 
 
+def test_a_file_chosen_while_an_upload_ends_stays_chosen(browser: Browser, machine: Demo) -> None:
+    """The upload chooses its file when the list has come; who chose another one meanwhile keeps it."""
+    tab = Visitor(browser)
+    late: list[tuple[WebSocketRoute, str | bytes]] = []
+    uploaded = asked = False
+
+    def route(socket: WebSocketRoute) -> None:
+        server = socket.connect_to_server()
+
+        def ask(text: str | bytes) -> None:
+            nonlocal asked
+            asked = asked or (uploaded and '"job.list"' in str(text))
+            server.send(text)
+
+        socket.on_message(ask)
+        server.on_message(lambda text: late.append((socket, text)) if asked else socket.send(text))
+
+    tab.page.route_web_socket(re.compile("/socket$"), route)
+    tab.page.goto(machine.ask("page.link")["url"])
+    files = tab.page.get_by_label("File")
+    tab.until("document.querySelectorAll('#job-files option[value=\"part.gcode\"]').length === 1")
+    uploaded = True
+    arrived = FilePayload(name="arrived.gcode", mimeType="text/plain", buffer=b"G1 X1\n")
+    tab.page.locator("#upload-file").set_input_files(arrived)
+    tab.wait_for(lambda: asked, "the list's turn")
+    files.select_option("part.gcode")
+    asked = uploaded = False
+    for socket, text in late:
+        socket.send(text)
+    tab.until("document.querySelectorAll('#job-files option[value=\"arrived.gcode\"]').length === 1")
+    assert files.input_value() == "part.gcode"
+    tab.close()
+
+
 # --------------------------------------------------------------------------------------------- how it looks
 
 
