@@ -308,9 +308,5 @@ class _UartConnector:
     def check_identity(self, found: bytes) -> None:
         pass  # the board at the other end of the cable is the node, whichever it is
 
-    @property
-    def can_suspect(self) -> bool:
-        return False
-
     def suspect(self) -> None:
         pass  # a node that restarts on a UART reports it itself

@@ -314,10 +314,6 @@ class _CanConnector:
                 "only one host assign ids on this bus"
             )
 
-    @property
-    def can_suspect(self) -> bool:
-        return True
-
     def suspect(self) -> None:
         self._bus.suspect()
 

@@ -215,6 +215,8 @@ class LinkIO:
         elif link := self._links.get(number):
             if notice == self._lib.IO_DRAINED:
                 link.handle_drained()
+            elif notice == self._lib.IO_SILENT:
+                link.on_silent()
             else:
                 link.handle_lost(value)
 

@@ -16,7 +16,7 @@ OnFrame = Callable[[Frame], None]
 class LinkInterface(Protocol):
     """The reliable connection to one node. Callbacks run on the control loop."""
 
-    on_sent: Callable[[], None]
+    on_silent: Callable[[], None]
 
     def send(  # noqa: D102
         self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False
@@ -25,7 +25,6 @@ class LinkInterface(Protocol):
     def send_urgent(self, content: bytes) -> None: ...  # noqa: D102
     def set_receive_window(self, size: int, /) -> None: ...  # noqa: D102
     def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None: ...  # noqa: D102
-    def pending(self) -> int: ...  # noqa: D102
     async def drained(self) -> None: ...  # noqa: D102
     def stats(self) -> Any: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102

@@ -37,8 +37,9 @@ class Link:
         self._on_responses = on_responses
         self._on_lost = on_lost
         self._name = bus.name if settings.nodeid is None else f"{bus.name} node {settings.nodeid}"
-        self.on_sent: Callable[[], None] = _ignore
-        """Called on the control loop when a command was queued, urgent ones left out."""
+        self.on_silent: Callable[[], None] = _ignore
+        """Called on the control loop when the node owes an acknowledgement and nothing has come from it for
+        LINK_SILENCE_MS, and again after as long."""
         self._failed: str | None = None
         self._drained: asyncio.Future[None] | None = None
         self._final: LinkStats | None = None
@@ -59,7 +60,6 @@ class Link:
         kind = self._lib.LINK_BULK if bulk else self._lib.LINK_CONTROL
         status = self._lib.io_send(self._live(), self._number, kind, data, len(content), min_clock, req_clock)
         self._check_command(status, len(content), "bulk" if bulk else "control")
-        self.on_sent()
 
     def send_batch(self, batch: "Buffer") -> None:
         """Queue the motion commands of a batch (format: batch.h), all or none; raises LinkError as send()."""
@@ -77,7 +77,6 @@ class Link:
                 f"{self._name}: a batch of {size} bytes ends within a record, or has a bad command"
             )
         self._check(status)
-        self.on_sent()
 
     def send_urgent(self, content: bytes) -> None:
         """Drop everything that is queued but unsent and send CONTENT next; raises LinkError as send().

@@ -1,18 +1,13 @@
 """Regular queries of one node's clock, and a check for a restart when the node goes silent."""
 
 import asyncio
-import contextlib
 from collections.abc import Awaitable, Callable
-from typing import Final
 
 from nodes.clock.clock import ClockEstimate, ClockEstimator
 from nodes.clock.wire_time import narrow
 from nodes.node.connector import ClockConnector
 from nodes.node.request_reply import Answer, QueryTimeout, RequestReply
 from nodes.support.errors import CanductorError
-
-SILENCE_S: Final = 0.25
-"""A node that owes an acknowledgement and is silent for so long may have restarted: the bus is queried."""
 
 
 class ClockKeeper:
@@ -39,8 +34,7 @@ class ClockKeeper:
         self._on_estimate = on_estimate
         self._on_sample = on_sample
         self._on_lost = on_lost
-        self._silence: asyncio.TimerHandle | None = None
-        """The next look for silence, while something was sent."""
+        talk.link.on_silent = connector.suspect
         self._task = asyncio.get_running_loop().create_task(self._keep())
         self._task.add_done_callback(self._ended)
 
@@ -67,46 +61,7 @@ class ClockKeeper:
             except CanductorError as error:
                 self._on_lost(str(error))
                 return
-            await self._wait_watching(self.estimator.next_sample_ns(0) * 1e-9)
-
-    async def _wait_watching(self, wait_s: float) -> None:
-        """Wait, and have the bus check the node when it owes an acknowledgement and is silent."""
-        if not self._connector.can_suspect:
-            await asyncio.sleep(wait_s)
-            return
-        if self._talk.connected:
-            self._talk.link.on_sent = self._watch_silence
-        if self._owes():
-            self._watch_silence()
-        try:
-            await asyncio.sleep(wait_s)
-        finally:
-            self._end_watch()
-            if self._talk.connected:
-                self._talk.link.on_sent = _ignore
-
-    def _watch_silence(self) -> None:
-        """Look in SILENCE_S whether the node is silent, unless that is going to happen."""
-        if self._silence is None:
-            loop = asyncio.get_running_loop()
-            self._silence = loop.call_later(SILENCE_S, self._look_for_silence, self._talk.heard)
-
-    def _look_for_silence(self, heard: int) -> None:
-        self._silence = None
-        with contextlib.suppress(CanductorError):  # the link is lost, which is handled elsewhere
-            if not self._owes():
-                return  # the next command begins it again
-            if heard == self._talk.heard:
-                self._connector.suspect()
-            self._watch_silence()
-
-    def _end_watch(self) -> None:
-        if self._silence is not None:
-            self._silence.cancel()
-            self._silence = None
-
-    def _owes(self) -> bool:
-        return self._talk.connected and self._talk.link.pending() > 0
+            await asyncio.sleep(self.estimator.next_sample_ns(0) * 1e-9)
 
     def _sampled(self, answer: Answer) -> None:
         if not self._take(answer):
@@ -134,7 +89,3 @@ class ClockKeeper:
         if message.name == "clock":
             return self.estimator.add(sent_ns, received_ns, message.integer("clock"))
         return self.estimator.begin(sent_ns, received_ns, message.integer("high"), message.integer("clock"))
-
-
-def _ignore() -> None:
-    """Do nothing."""

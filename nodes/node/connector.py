@@ -16,10 +16,6 @@ class ClockConnector(Protocol):
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
         """Return the least time that a block takes on the wire; 0 where that is not known."""
 
-    @property
-    def can_suspect(self) -> bool:
-        """Whether ``suspect`` can find out anything; on a UART a node that restarts reports it itself."""
-
     def suspect(self) -> None:
         """Check whether a silent node restarted; if it did, the bus notifies the node."""
 

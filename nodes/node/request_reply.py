@@ -105,8 +105,6 @@ class RequestReply:
         self.dictionary: Dictionary = BOOTSTRAP
         self.undecodable = 0
         """Responses that no format of the dictionary fits: damaged, or from other firmware."""
-        self.heard = 0
-        """All responses received."""
         self._link: LinkInterface | None = None
         self._waiters: list[_Waiter] = []
         self._listeners: dict[tuple[str, int | None], list[Callback]] = {}
@@ -243,7 +241,6 @@ class RequestReply:
 
     def receive(self, responses: Sequence[Response]) -> None:
         """Handle the responses that the link received."""
-        self.heard += len(responses)
         for response in responses:
             message = self.dictionary.decode(response.content)
             if message is None:

@@ -191,7 +191,7 @@ class TwinLink:
         self.receive_window = 192
         self.clocks: list[tuple[float, int, int]] = []
         self.sent: list[tuple[bytes, int, int]] = []
-        self.on_sent: Callable[[], None] = lambda: None
+        self.on_silent: Callable[[], None] = lambda: None
 
     def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False) -> None:
         assert not self.closed
@@ -228,9 +228,6 @@ class TwinLink:
 
     def send_urgent(self, content: bytes) -> None:
         self.send(content)
-
-    def pending(self) -> int:
-        return len(self._to_node)
 
     async def drained(self) -> None:
         while self._to_node:  # noqa: ASYNC110  virtual time

@@ -343,6 +343,18 @@ static void forgive_sleep(struct link *link, uint64_t now) {
         link->progress_ns = now - quarter_ns;
 }
 
+static uint64_t later_of(uint64_t a_ns, uint64_t b_ns) {
+    return a_ns > b_ns ? a_ns : b_ns;
+}
+
+static void count_silence(struct link *link, uint64_t now) {
+    uint64_t since_ns = later_of(link->silence_ns, later_of(link->heard_ns, link->progress_ns));
+    if (link->state != LINK_RUNNING || now < since_ns + LINK_SILENCE_MS * NS_PER_MS)
+        return;
+    link->silence_ns = now;
+    link->silences++;
+}
+
 void link_handle_timer(struct link *link, uint64_t now) {
     if (link->state == LINK_LOST)
         return;
@@ -355,6 +367,7 @@ void link_handle_timer(struct link *link, uint64_t now) {
     if (now >= repeat_deadline(link)) {
         link->stats.timeouts++;
         link->backoff++;
+        count_silence(link, now);
         link_rewind(link, now, LEAD_FLUSH);
     }
 }

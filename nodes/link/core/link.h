@@ -24,6 +24,7 @@ enum {
     LINK_WIRE_MAX = 144,    // most bytes link_next_block writes: a block twice, with sync bytes before each
     LINK_RX_MAX = 256,      // received bytes that wait for the rest of their block
     LINK_LEAD_BUCKETS = 16, // late, < 1 ms, < 2 ms, < 4 ms, … >= 2^13 ms
+    LINK_SILENCE_MS = 250,  // a node that owes an acknowledgement may have restarted
 };
 
 enum link_status {
@@ -116,6 +117,8 @@ struct link {
     uint64_t motion_content;      // content bytes of motion commands sent so far, once each
     uint64_t progress_ns;         // last acknowledgement, or when the link stopped being idle
     uint64_t heard_ns;            // last valid block
+    uint64_t silence_ns;          // when a silence was counted last
+    uint64_t silences;            // repeats after LINK_SILENCE_MS, each, without a block from the node
     uint64_t last_ack;            // sequence of the last empty block
     uint64_t naks_outstanding, outstanding_until_ns,
         outstanding_until_seq; // naks that the last repeats may still cause

@@ -93,6 +93,7 @@ enum io_notice {
     IO_RESPONSE, // a link's response
     IO_FRAME,    // a CAN frame that belongs to no link
     IO_DRAINED,  // nothing is pending on a link (io_watch_drained)
+    IO_SILENT,   // a node owes an acknowledgement and said nothing for LINK_SILENCE_MS, or for as long again
     IO_LOST,     // a link is lost; value: enum link_cause
     IO_ENDED,    // the transport failed or was closed by its peer; value: errno, 0 for an end of file
 };

@@ -41,6 +41,8 @@ struct io_link {
     uint8_t lost_reported; // and was reported
     uint8_t watch_drained; // an IO_DRAINED was requested
     uint8_t drained_pending;
+    uint8_t silent_pending;  // an IO_SILENT is due
+    uint64_t silences;       // of the link, that were reported
     uint8_t cut[IO_CUT_MAX]; // bytes of blocks that are being split into frames
     size_t cut_at, cut_size;
     struct link_offer cut_offer; // of the newest block in there

@@ -141,6 +141,11 @@ void io_note_states(struct io_bus *bus) {
             node->lost_reported = node->lost_pending = 1;
             io_notify(bus);
         }
+        if (node->link.silences != node->silences) {
+            node->silences = node->link.silences;
+            node->silent_pending = 1;
+            io_notify(bus);
+        }
         if (node->watch_drained && link_pending(&node->link) == 0) {
             node->watch_drained = 0;
             node->drained_pending = 1;
@@ -174,8 +179,10 @@ static size_t take_notices(struct io_bus *bus, struct io_event *out, size_t room
     for (size_t i = 0; i < bus->link_count; i++) {
         struct io_link *node = bus->links[i];
         struct io_event drained = {.notice = IO_DRAINED, .link = node->number};
+        struct io_event silent = {.notice = IO_SILENT, .link = node->number};
         struct io_event lost = {.notice = IO_LOST, .link = node->number, .value = (int32_t)node->link.cause};
         taken += take_notice(&node->drained_pending, out + taken, room - taken, drained);
+        taken += take_notice(&node->silent_pending, out + taken, room - taken, silent);
         taken += take_notice(&node->lost_pending, out + taken, room - taken, lost);
     }
     struct io_event ended = {.notice = IO_ENDED, .value = bus->ended_errno};

@@ -18,23 +18,6 @@ BITRATE = "CANBUS_FREQUENCY"
 OUT_NS, BACK_NS = 120_000, 150_000
 
 
-class OwingLink(TwinLink):
-    """Says how many commands the node has not acknowledged."""
-
-    owed = 0
-    looks = 0
-    """How often that was asked for."""
-
-    def pending(self) -> int:
-        self.looks += 1
-        return self.owed
-
-    def queue(self) -> None:
-        """Queue a command that the node does not acknowledge."""
-        self.owed += 1
-        self.on_sent()
-
-
 class Bench:
     """A keeper over a real conversation with a twin node, and what it reported; it is its connector, too."""
 
@@ -42,7 +25,7 @@ class Bench:
         self.twin = TwinNode()
         self.io = TwinIO([self.twin])
         self.talk = RequestReply("mainboard")
-        self.link = OwingLink(self.io, self.twin, self.talk.receive, lambda _: None)
+        self.link = TwinLink(self.io, self.twin, self.talk.receive, lambda _: None)
         self.talk.attach(self.link)
         known = {key: value for key, value in self.twin.dictionary.constants.items() if key != BITRATE}
         self.talk.dictionary = self.twin.dictionary
@@ -59,8 +42,6 @@ class Bench:
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
         self.blocks.append((content_bytes, bitrate, answer))
         return BACK_NS if answer else OUT_NS
-
-    can_suspect = True
 
     def suspect(self) -> None:
         self.suspected_s.append(asyncio.get_running_loop().time())
@@ -168,58 +149,14 @@ def test_an_answer_of_unknown_times_is_not_used() -> None:
     bench.run(main)
 
 
-def test_silence_is_not_watched_where_nothing_can_be_found_out() -> None:
-    bench = Bench()
-    bench.can_suspect = False
-
-    async def main(keeper: ClockKeeper) -> None:
-        await keeper.ready.wait()
-        bench.link.queue()
-        await asyncio.sleep(0.9)
-        assert bench.link.looks == 0, "it would wake the computer for nothing"
-        assert bench.suspected_s == []
-
-    bench.run(main)
-
-
-def test_a_node_that_owes_answers_and_says_nothing_is_suspected_every_quarter_of_a_second() -> None:
+def test_a_node_of_whose_silence_the_link_tells_is_suspected() -> None:
     bench = Bench()
 
     async def main(keeper: ClockKeeper) -> None:
         await keeper.ready.wait()
-        sampled_s = bench.sampled_s[-1]
-        bench.link.queue()
-        await asyncio.sleep(0.98)
-        assert [t - sampled_s for t in bench.suspected_s] == pytest.approx([0.25, 0.5, 0.75], abs=1e-6)
-        await asyncio.sleep(0.1)
-        assert len(bench.suspected_s) == 3, "an answer to the next question"
-        await asyncio.sleep(0.25)
-        bench.link.say(bench.twin.response("clock", clock=5))  # whatever it says
-        await asyncio.sleep(0.2)
-        bench.suspected_s.clear()
-        await asyncio.sleep(0.1)
         assert bench.suspected_s == []
-        bench.talk.detach()
-        await asyncio.sleep(0.25)
-        assert bench.suspected_s == []
-
-    bench.run(main)
-
-
-def test_silence_is_looked_for_only_after_something_was_sent() -> None:
-    bench = Bench()
-
-    async def main(keeper: ClockKeeper) -> None:
-        await keeper.ready.wait()
-        await asyncio.sleep(0.1)
-        bench.link.looks, samples = 0, len(bench.sampled_s)
-        await asyncio.sleep(9.9)
-        assert bench.link.looks == len(bench.sampled_s) - samples == 10, "one for each sample, none between"
-        bench.link.queue()
-        bench.link.owed = 0  # acknowledged at once
-        await asyncio.sleep(0.5)
-        assert bench.link.looks == 11
-        assert bench.suspected_s == []
+        bench.link.on_silent()
+        assert len(bench.suspected_s) == 1
 
     bench.run(main)
 

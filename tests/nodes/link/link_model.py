@@ -79,7 +79,7 @@ class LinkModel:
         self.first = self.cursor = self.next = 16
         self.slots: dict[int, Sent] = {slot: Sent() for slot in range(16)}
         self.urgent = False
-        self.progress_ns = self.heard_ns = 0
+        self.progress_ns = self.heard_ns = self.silence_ns = self.silences = 0
         self.last_ack: int | None = None
         self.naks_outstanding = self.outstanding_until_ns = self.outstanding_until = 0
         self.backoff = 0
@@ -228,6 +228,10 @@ class LinkModel:
         elif now >= self._repeat_at:
             self.count["timeouts"] += 1
             self.backoff += 1
+            since_ns = max(self.silence_ns, self.heard_ns, self.progress_ns)
+            if self.state == "running" and now >= since_ns + 250 * MS:
+                self.silence_ns = now
+                self.silences += 1
             self._rewind(now, "flush")
 
     def deadline(self, now: int, allowed: int) -> int:

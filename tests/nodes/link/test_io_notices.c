@@ -166,6 +166,42 @@ static void a_drained_link_is_told_of_once_when_it_is(void) {
     io_free(scene.bus);
 }
 
+// The node at FIRST_NODE + AT acknowledges what came before SEQUENCE.
+static void acknowledge(struct scene *scene, unsigned at, unsigned sequence) {
+    uint8_t block[WIRE_BLOCK_MAX];
+    CHECK_EQUAL(wire_block_finish(block, 0, sequence), WIRE_BLOCK_MIN);
+    frame_comes(scene, 0x101 + 2 * (FIRST_NODE + at), block, WIRE_BLOCK_MIN);
+    send_all(scene);
+}
+
+static void a_silent_node_is_told_of_again_and_again_until_it_is_lost(void) {
+    struct scene scene;
+    struct io_event events[2];
+    unsigned silences = 0, losses = 0;
+    begin(&scene);
+    send_control(&scene, 1);
+    for (unsigned sequence = 0; sequence < 2; sequence++) // it begins, and is asked again
+        acknowledge(&scene, 1, sequence);
+    uint64_t asked_ns = scene.now_ns;
+    while (!losses) {
+        scene.now_ns += 10 * MS;
+        io_handle_time(scene.bus, scene.now_ns);
+        send_all(&scene);
+        size_t taken = io_take(scene.bus, events, 2);
+        CHECK(taken < 2);
+        if (!taken)
+            continue;
+        CHECK_EQUAL(events[0].link, scene.links[1]);
+        silences += events[0].notice == IO_SILENT;
+        losses += events[0].notice == IO_LOST;
+        CHECK(silences + losses > 0);
+        CHECK(scene.now_ns - asked_ns >= (silences + losses) * LINK_SILENCE_MS * MS);
+    }
+    CHECK_EQUAL(silences, 3);
+    CHECK_EQUAL(scene.now_ns - asked_ns, usual.lost_after_ns);
+    io_free(scene.bus);
+}
+
 static void a_full_ring_drops_what_is_oldest(void) {
     struct scene scene;
     static struct io_event events[IO_FRAMES_MAX + 1];
@@ -262,6 +298,7 @@ static void what_was_held_back_is_due_once(void) {
 int main(void) {
     notices_come_in_order_whatever_room_there_is();
     a_drained_link_is_told_of_once_when_it_is();
+    a_silent_node_is_told_of_again_and_again_until_it_is_lost();
     a_ring_that_is_emptied_begins_again();
     a_full_ring_drops_what_is_oldest();
     counters_keep_up_with_what_is_taken();

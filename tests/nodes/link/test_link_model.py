@@ -217,6 +217,7 @@ class Pair:
         assert lib.link_pending(real) == model.pending
         assert lib.link_unanswered_since(real) == model.unanswered_since
         assert real.motion_content == model.motion_content
+        assert real.silences == model.silences
         for allowed in range(ALL + 1):
             offer = model.next_offer(now, allowed)
             expected = None if offer is None else (offer.kind, offer.due_ns, offer.urgent)

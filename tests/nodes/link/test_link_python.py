@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 HZ = 1_000_000
+NEVER = 2**64 - 1
 START_TICKS = 5_000_000
 
 
@@ -56,7 +57,11 @@ class Line:
 
     def lose(self) -> None:
         """Let the link be lost in C; Python has not taken the notice yet."""
-        self.driver.exchange({0: NodeTwin(window=0)}, lambda: bool(self.driver.noticed))
+        driver = self.driver
+        driver.exchange(
+            {0: NodeTwin(window=0)},
+            lambda: bool(driver.noticed) and lib.io_deadline(driver.bus, driver.now) == NEVER,
+        )
 
     def raw(self) -> Any:
         raw = ffi.new("struct io_link_stats *")
@@ -236,6 +241,19 @@ def test_a_silent_node_is_lost_in_words() -> None:
             line.link.send(ask(2))
 
     run(test())
+
+
+def test_a_silent_node_is_told_of_before_it_is_lost() -> None:
+    line = Line().connected()
+    silent: list[int] = []
+    line.link.on_silent = lambda: silent.append(line.driver.now)
+    line.link.send(ask(1))
+    asked_ns = line.driver.now
+    line.driver.exchange({0: NodeTwin(window=0)}, lambda: bool(line.driver.noticed))
+    line.driver.hand_over()
+    [silent_ns] = silent
+    assert lib.LINK_SILENCE_MS * 1_000_000 <= silent_ns - asked_ns < 500_000_000
+    assert line.inbox.lost == []
 
 
 def test_a_node_that_takes_nothing_is_lost_in_other_words() -> None:

@@ -574,6 +574,63 @@ static void the_silence_counts_from_the_last_progress(void) {
     CHECK_EQUAL(scene.link.cause, LINK_CAUSE_SILENT); // the last that was heard was the progress
 }
 
+// Lets repeats go, each when it is due, until AT_NS.
+static void nothing_comes_until(struct scene *scene, uint64_t at_ns) {
+    while (deadline_of(scene) <= at_ns) {
+        time_passes(scene, deadline_of(scene));
+        while (go(scene) > 0)
+            ;
+    }
+    time_passes(scene, at_ns);
+}
+
+// Repeats at 20, 60, 140, 265, 390, 515, 640, 765 ms …: of them those that no block came before for 250 ms.
+static void a_silence_is_counted_at_a_repeat_when_a_quarter_of_a_second_is_over(void) {
+    static const unsigned silent_from_ms[] = {265, 515, 765};
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    nothing_comes_until(&scene, scene.now + 7 * SECOND);
+    CHECK_EQUAL(scene.link.silences, 0); // it owes nothing
+    block_goes(&scene, 'a', 1);
+    uint64_t sent_ns = scene.now;
+    for (unsigned i = 0; i < 3; i++) {
+        nothing_comes_until(&scene, sent_ns + silent_from_ms[i] * MS - 1);
+        CHECK_EQUAL(scene.link.silences, i);
+        nothing_comes_until(&scene, sent_ns + silent_from_ms[i] * MS);
+        CHECK_EQUAL(scene.link.silences, i + 1);
+    }
+    lose(&scene);
+    CHECK_EQUAL(scene.link.silences, 3);
+}
+
+static void whatever_comes_ends_the_silence(void) {
+    for (int acknowledged = 0; acknowledged < 2; acknowledged++) {
+        struct scene scene;
+        open_running(&scene, WINDOW);
+        block_goes(&scene, 'a', 1);
+        block_goes(&scene, 'b', 1);
+        uint64_t sent_ns = scene.now;
+        nothing_comes_until(&scene, sent_ns + 200 * MS);
+        if (acknowledged)
+            answer(&scene, scene.link.first + 1, 0);
+        else
+            answer(&scene, scene.link.first, 4); // a response says nothing about what it has
+        nothing_comes_until(&scene, sent_ns + 200 * MS + LINK_SILENCE_MS * MS - 1);
+        CHECK_EQUAL(scene.link.silences, 0);
+        nothing_comes_until(&scene, sent_ns + 600 * MS);
+        CHECK_EQUAL(scene.link.silences, 1);
+    }
+}
+
+static void before_contact_there_is_no_silence(void) {
+    struct scene scene;
+    open_link(&scene, WINDOW, SECOND);
+    control(&scene, 'a', 1);
+    CHECK(go(&scene) > 0);
+    lose(&scene);
+    CHECK_EQUAL(scene.link.silences, 0);
+}
+
 static void a_node_that_accepts_nothing_is_stuck(void) {
     struct scene scene;
     open_running(&scene, WINDOW);
@@ -684,6 +741,9 @@ int main(void) {
     what_was_never_sent_is_not_acknowledged();
     only_a_second_empty_block_is_a_nak();
     the_silence_counts_from_the_last_progress();
+    a_silence_is_counted_at_a_repeat_when_a_quarter_of_a_second_is_over();
+    whatever_comes_ends_the_silence();
+    before_contact_there_is_no_silence();
     a_node_that_accepts_nothing_is_stuck();
     a_lost_link_does_nothing_more();
     the_end_is_no_timeout();
