@@ -45,6 +45,8 @@ class Client:
         self._framer = Framer()
         self._urgent: deque[bytes] = deque()
         self._waiting: deque[bytes] = deque()
+        self._overtaken = 0
+        """How many of those, the first ones, an urgent message has come behind."""
 
     @property
     def listens(self) -> bool:
@@ -66,7 +68,11 @@ class Client:
             self.fault = fault
             return
         for body in bodies:
-            (self._urgent if is_urgent(body) else self._waiting).append(body)
+            if is_urgent(body):
+                self._urgent.append(body)
+                self._overtaken = len(self._waiting)
+            else:
+                self._waiting.append(body)
 
     def next_request(self) -> Request | None:
         """Return the call that is next, one that stops the machine first; None: there is none.
@@ -76,8 +82,10 @@ class Client:
         waiting = self._urgent or self._waiting
         if not waiting:
             return None
+        overtaken = waiting is self._waiting and self._overtaken > 0
+        self._overtaken -= overtaken
         try:
-            return read_request(waiting.popleft())
+            return read_request(waiting.popleft(), overtaken=overtaken)
         except UnreadableError:
             self.dropped += 1
             raise

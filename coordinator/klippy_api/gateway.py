@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
+from coordinator.ipc.protocol.overtaken import doing
 from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.unix_socket import UnixListener, may_use, peer_of
@@ -245,6 +246,10 @@ class Gateway:
 
     def call(self, connection: Connection, request: Request) -> None:
         """Begin REQUEST; it is answered when it is done."""
+        with doing(overtaken=request.overtaken):
+            self._begin(connection, request)
+
+    def _begin(self, connection: Connection, request: Request) -> None:
         client = connection.client
         if request.method != "emergency_stop" and (
             client.running >= RUNNING_MAX or len(self._tasks) >= CALLS_MAX

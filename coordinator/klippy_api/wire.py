@@ -38,6 +38,8 @@ class Request:
     params: Mapping[str, Any]
     id: Any = None
     """Of any JSON type; None: no answer is wanted."""
+    overtaken: bool = False
+    """An urgent one came behind it, and was done first."""
 
 
 class Framer:
@@ -76,7 +78,7 @@ def is_urgent(body: bytes) -> bool:
     return any(word in capitals for word in URGENT)
 
 
-def read_request(body: bytes) -> Request:
+def read_request(body: bytes, *, overtaken: bool = False) -> Request:
     """Return the call in BODY; raises UnreadableError."""
     try:
         message = decode_json(body, LIMITS)
@@ -90,7 +92,7 @@ def read_request(body: bytes) -> Request:
         raise UnreadableError("a message has no method")
     if not isinstance(params, dict):
         raise UnreadableError("the params of a message are not an object")
-    return Request(method, params, message.get("id"))
+    return Request(method, params, message.get("id"), overtaken)
 
 
 def encode(message: Mapping[str, Any]) -> bytes:

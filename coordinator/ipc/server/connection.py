@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final
 
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.ipc.protocol.overtaken import doing
 from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.session import Request, Session
 from coordinator.support.values import Value
@@ -203,6 +204,10 @@ class Connection(asyncio.BufferedProtocol):
     # ---------------------------------------------------------------------------------------- methods
 
     def _call(self, request: Request) -> None:
+        with doing(overtaken=request.overtaken):
+            self._begin(request)
+
+    def _begin(self, request: Request) -> None:
         caller = self.session.caller
         assert caller is not None
         try:

@@ -37,12 +37,14 @@ class Request:
     """A request with its parameters, checked. ID is None when no answer is wanted.
 
     IGNORED: what was wrong with an urgent one, which is carried out all the same; empty: nothing.
+    OVERTAKEN: an urgent one came behind it and was called first.
     """
 
     id: int | None
     method: Method
     params: dict[str, Any]
     ignored: str = ""
+    overtaken: bool = False
 
 
 @dataclass(slots=True)
@@ -392,6 +394,8 @@ class Session:
             self._perform(request, immediate, now_s)
         elif request.method.urgent:
             urgent.append(request)
+            for waiting in self._waiting:
+                waiting.overtaken = True
         elif len(self._waiting) >= self._limits.pending_requests:
             self.counters.refused_busy += 1
             most = self._limits.pending_requests

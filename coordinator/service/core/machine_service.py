@@ -18,6 +18,7 @@ from coordinator.gcode.events import Notice
 from coordinator.gcode.program import Program
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.ipc.protocol.overtaken import is_overtaken
 from coordinator.ipc.server.state import StateTree
 from coordinator.modules.module_set import build_modules
 from coordinator.runtime.host import Host
@@ -363,8 +364,12 @@ class MachineService:
 
         Nodes are configured again where that is needed; with FIRMWARE all are reset. While a stop is unread
         it raises ApiError, too: the stop lane may have carried it out, and read later it would stop the
-        machine that this makes.
+        machine that this makes. So it does for a request behind which the same client has sent a stop.
         """
+        if is_overtaken():
+            raise ApiError(
+                "busy", "an emergency stop that was sent behind it came first; ask again for a restart"
+            )
         if (who := self.find_unread_stop()) is not None:
             raise ApiError("busy", f"an emergency stop by {who} has just come; ask again when it is done")
         if self.state is ServiceState.STARTUP:

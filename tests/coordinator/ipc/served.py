@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Registry, Scope
+from coordinator.ipc.protocol.overtaken import is_overtaken
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
@@ -63,7 +64,7 @@ def registry_of(served: Served) -> Registry:
     registry = Registry()
 
     def info(caller: Caller, _: dict[str, Any]) -> Value:
-        served.order.append("info")
+        served.order.append("info, overtaken" if is_overtaken() else "info")
         return {"caller": caller.name, "scope": caller.scope.word}
 
     def move(_: Caller, params: dict[str, Any]) -> Value:

@@ -27,6 +27,17 @@ def test_an_emergency_stop_overtakes_what_waits(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
+def test_what_is_asked_for_before_a_stop_knows_that_it_was_overtaken(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        script = await served.script()
+        for number, method in enumerate(("machine.info", "machine.emergency_stop", "machine.info")):
+            script.send(method, number)
+        assert [(await script.receive())["id"] for _ in range(3)] == [1, 0, 2]
+        assert served.order == ["stop", "info, overtaken", "info"]
+
+    run(tmp_path, body)
+
+
 def test_an_emergency_stop_comes_through_when_nothing_else_does(tmp_path: Path) -> None:
     """All places to run and to wait are taken, answers are not read: it acts all the same."""
 

@@ -52,6 +52,7 @@ gcode:
     M117 quiet
 """
 )
+STOP = b'{"method":"emergency_stop"}\x03'
 JOB = "M83\nM109 S210\n" + "".join(f"G1 X{20 + 20 * (n % 2)} Y{20 + n} E0.01 F6000\n" for n in range(60))
 
 
@@ -386,7 +387,8 @@ async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: 
     said = client.said()
     assert said[0].startswith("B:")
     assert said[1].startswith("FIRMWARE_NAME:")
-    client.send("gcode/firmware_restart")
+    await _check_restarts_that_a_stop_overtakes(client, served)
+    client.send_bytes(STOP + b'{"method":"gcode/firmware_restart"}\x03')
     await asyncio.sleep(1.0)
     assert client.transport.ended, "so that clients read everything again"
     again = api.connect()
@@ -404,6 +406,21 @@ async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: 
     assert seen
     stats = (await again.query("print_stats"))["print_stats"]
     assert (stats["state"], stats["filename"]) == ("standby", "")
+
+
+async def _check_restarts_that_a_stop_overtakes(client: KlippyClient, served: Served) -> None:
+    """What was sent first does not undo the stop behind it; failed before."""
+    starts = served.service.starts
+    for call in (
+        {"method": "gcode/restart", "id": 900},
+        {"method": "gcode/firmware_restart", "id": 900},
+        {"method": "gcode/script", "params": {"script": "FIRMWARE_RESTART"}, "id": 900},
+    ):
+        client.send_bytes(json.dumps(call).encode() + b"\x03" + STOP)
+        refused = await client.answer(900)
+        assert "an emergency stop that was sent behind it came first" in refused["error"]["message"]
+    await asyncio.sleep(1.0)
+    assert (served.service.starts, str(served.service.state)) == (starts, "shutdown")
 
 
 def test_a_configuration_that_does_not_load(tmp_path: Path) -> None:
