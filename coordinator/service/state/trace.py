@@ -128,9 +128,9 @@ class MotionTrace:
     def _pieces_since(self, since_s: float) -> Iterator[bytes]:
         """Yield the moves that end after print time SINCE_S, in pieces with at least one, oldest first."""
         for piece in self._pieces:
-            count = len(piece) // MOVE_BYTES
-            first = bisect_right(range(count), since_s, key=lambda i: end_s(piece, i))
-            if first < count:
+            if end_s(piece, -1) > since_s:
+                count = len(piece) // MOVE_BYTES
+                first = bisect_right(range(count), since_s, key=lambda i: end_s(piece, i))
                 yield piece[first * MOVE_BYTES :]
 
     @property
