@@ -223,11 +223,11 @@ class _Process:
         return RenderingFailed(1, problem)
 
     def _check(self, answer: dict[str, Any]) -> None:
-        """Raise what ANSWER says went wrong."""
+        """Raise what ANSWER says went wrong; end a process whose memory the next one may not find enough."""
+        if answer.get("memory"):
+            self.close()
         if "problem" not in answer:
             return
-        if answer.get("memory"):
-            self.close()  # what is left of it may be in pieces
         line = answer.get("line")
         raise RenderingFailed(line if isinstance(line, int) else 1, str(answer["problem"]), _actions(answer))
 

@@ -4,6 +4,7 @@ It serves requests from its standard input, a socket, until that ends (messages.
 takes of memory and, should the program have died, of processor time; it may write no file.
 """
 
+import gc
 import json
 import resource
 import socket
@@ -20,6 +21,9 @@ from coordinator.gcode.templates.sandbox import Meter
 
 MEMORY_BYTES: Final = 64 * 1024 * 1024
 """That rendering may take, beyond what the process has at its start."""
+KEPT_BYTES_MAX: Final = MEMORY_BYTES // 4
+"""That renderings may leave behind, all together; a process that keeps more is replaced. What is free in it
+is in pieces, and a template that needs little would find too little."""
 _ALONE_CPU_S: Final = 3
 """Processor time for one request after which the kernel ends the process, when nobody else does."""
 
@@ -109,6 +113,8 @@ class Worker:
         self._channel = channel
         self._compiler = TemplateCompiler()
         self._compiled: dict[int, Template] = {}
+        self._kept_bytes = 0
+        """By which renderings have made this process larger."""
         self._known: dict[tuple[str, ...], tuple[Any, ...]] = {}
         """What the program has sent with the request, by path."""
 
@@ -154,7 +160,7 @@ class Worker:
         try:
             self._compiled[number] = self._compiler.compile(text)
         except Failed as failed:
-            self._fail(failed, [])
+            self._answer(_problem(failed))
         else:
             self._answer({"compiled": True})
 
@@ -162,23 +168,30 @@ class Worker:
         self, number: int, values: Mapping[str, object], known: dict[tuple[str, ...], tuple[Any, ...]]
     ) -> None:
         self._known = known
+        before_bytes = _size_bytes()
         meter = Meter()
         actions = Actions(meter)
         printer = RemoteMapping(self, ())
+        text, lines, memory = "", None, False
+        answer: dict[str, object] = {"actions": actions.asked}
         try:
             text, lines = self._compiler.render(
                 self._compiled[number], {**values, "printer": printer, **actions.functions()}, meter
             )
         except Ended as ended:
-            end = {"end": str(ended), "emergency": ended.emergency, "actions": actions.asked}
-            self._answer(end)
+            answer |= {"end": str(ended), "emergency": ended.emergency}
         except Failed as failed:
-            self._fail(failed, actions.asked)
-        else:
-            self._channel.sendall(encode_answer({"actions": actions.asked}, text, lines))
+            answer |= _problem(failed)
+            memory = failed.memory
+        if _size_bytes() > before_bytes:
+            gc.collect()  # an error's traceback goes in circles, and keeps what was built
+            self._kept_bytes += _size_bytes() - before_bytes
+        answer["memory"] = memory or self._kept_bytes > KEPT_BYTES_MAX
+        self._channel.sendall(encode_answer(answer, text, lines))
 
-    def _fail(self, failed: Failed, asked: list[tuple[Any, ...]]) -> None:
-        self._answer({"problem": str(failed), "line": failed.line, "memory": failed.memory, "actions": asked})
+
+def _problem(failed: Failed) -> dict[str, object]:
+    return {"problem": str(failed), "line": failed.line, "memory": failed.memory}
 
 
 def _plain(value: object) -> object:
@@ -199,9 +212,13 @@ def _bound_cpu() -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
 
 
+def _size_bytes() -> int:
+    """Return the size of this process's address space, which is what ``_bound_memory`` bounds."""
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+
+
 def _bound_memory() -> None:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    size = _within(resource.RLIMIT_AS, pages * resource.getpagesize() + MEMORY_BYTES)
+    size = _within(resource.RLIMIT_AS, _size_bytes() + MEMORY_BYTES)
     resource.setrlimit(resource.RLIMIT_AS, (size, size))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

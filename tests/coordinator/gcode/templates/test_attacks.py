@@ -14,9 +14,10 @@ import pytest
 from coordinator.gcode.place import Place
 from coordinator.gcode.templates.messages import JSON_BYTES_MAX, BadAnswer, encode_answer, read_answer
 from coordinator.gcode.templates.renderer import RenderingFailed, TemplateRenderer
-from coordinator.gcode.templates.templates import Template, TemplateError
+from coordinator.gcode.templates.templates import Asked, Template, TemplateError
+from coordinator.gcode.templates.worker import MEMORY_BYTES
 from tests.coordinator.gcode.templates.attacks import ATTACKS, SENTENCES
-from tests.coordinator.gcode.templates.workers import children
+from tests.coordinator.gcode.templates.workers import children, size_bytes
 from tests.stages.printer_text import PRINTER_CFG, write
 
 TICKS = 3
@@ -83,6 +84,19 @@ def test_a_worker_that_dies_is_named_and_replaced() -> None:
     with contextlib.suppress(ChildProcessError):  # it was missed already
         os.waitid(os.P_PID, between, os.WEXITED | os.WNOWAIT)
     assert worker() != between
+
+
+@pytest.mark.parametrize(
+    "end", ["{ l.nothing.x }", "{ action_raise_error('x') }", "{% do l.append(l) %}", "{ l|length }"]
+)
+def test_the_next_template_does_not_miss_what_one_has_built(end: str) -> None:
+    """A worker that keeps much is replaced; before, a template could not be read for want of memory."""
+    before_bytes = size_bytes(worker())
+    built = "{% set l = [] %}{% for i in range(4500) %}{% do l.append('a'.center(9999)) %}{% endfor %}"
+    for _ in range(4):
+        with contextlib.suppress(TemplateError, Asked):
+            Template(built + end).render({})
+        assert size_bytes(worker()) - before_bytes < MEMORY_BYTES // 2
 
 
 def test_values_arrive_as_they_were() -> None:

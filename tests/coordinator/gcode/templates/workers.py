@@ -14,3 +14,9 @@ def children() -> list[int]:
             if parent == os.getpid() and b"templates.worker" in (process / "cmdline").read_bytes():
                 found.append(int(process.name))
     return found
+
+
+def size_bytes(process: int) -> int:
+    """Return the size of the address space of PROCESS."""
+    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[0])
+    return pages * os.sysconf("SC_PAGESIZE")
