@@ -6,11 +6,11 @@ takes of memory and, should the program have died, of processor time; it may wri
 
 import gc
 import json
+import os
 import resource
 import socket
 import time
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any, Final
 
 from jinja2 import ChainableUndefined, Template
@@ -24,6 +24,7 @@ MEMORY_BYTES: Final = 64 * 1024 * 1024
 KEPT_BYTES_MAX: Final = MEMORY_BYTES // 4
 """That renderings may leave behind, all together; a process that keeps more is replaced. What is free in it
 is in pieces, and a template that needs little would find too little."""
+_STATM: Final = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
 _ALONE_CPU_S: Final = 3
 """Processor time for one request after which the kernel ends the process, when nobody else does."""
 
@@ -214,7 +215,7 @@ def _bound_cpu() -> None:
 
 def _size_bytes() -> int:
     """Return the size of this process's address space, which is what ``_bound_memory`` bounds."""
-    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    return int(os.pread(_STATM, 32, 0).split()[0]) * resource.getpagesize()
 
 
 def _bound_memory() -> None:
