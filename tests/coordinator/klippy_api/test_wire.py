@@ -83,6 +83,22 @@ def test_numbers_that_json_does_not_have_go_out_as_null() -> None:
     assert json.loads(message[:-1]) == {"a": None, "b": [1.0, None], "c": {"d": None}}
 
 
+def test_what_came_before_a_stop_knows_that_it_was_overtaken_and_nothing_else_does() -> None:
+    client = Client("a client")
+
+    def takes(*methods: str) -> list[tuple[str, bool]]:
+        client.receive(b"".join(b'{"method":"%s"}\x03' % method.encode() for method in methods))
+        found = []
+        while (request := client.next_request()) is not None:
+            found.append((request.method, request.overtaken))
+        return found
+
+    before, stop, behind = ("info", True), ("emergency_stop", False), ("list_endpoints", False)
+    assert takes("info", "info", "emergency_stop", "list_endpoints") == [stop, before, before, behind]
+    assert takes("list_endpoints") == [behind]
+    assert takes("emergency_stop", "list_endpoints") == [stop, behind]
+
+
 def test_a_stop_is_looked_at_before_all_that_waits() -> None:
     client = Client("a client")
     calls = [b'{"method": "info", "id": %d}\x03' % number for number in range(100)]
