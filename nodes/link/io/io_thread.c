@@ -11,8 +11,8 @@
 #include <stdlib.h>
 #include <sys/eventfd.h>
 #include <sys/ioctl.h>
-#include <sys/prctl.h>
 #include <sys/socket.h>
+#include <sys/timerfd.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -25,16 +25,15 @@
 enum { KERNEL_FRAMES = 16, FRAME = sizeof(struct can_frame), SKB_BYTES = 768, WRITES = 32 };
 
 struct io_thread {
-    int fd, wake_fd, notice_fd;
+    int fd, wake_fd, timer_fd, notice_fd;
     enum io_kind kind;
     struct io_bus *bus;
     pthread_t thread;
     pthread_mutex_t mutex;
     uint8_t stopping;
-    uint8_t sleeping;        // the thread sleeps, or is about to, and was not woken
     uint8_t kernel_full;     // wait until the descriptor is writable
     uint64_t retry_ns;       // when to try again after ENOBUFS; 0: not now
-    uint64_t sleep_until_ns; // when the sleeping thread wakes by itself
+    uint64_t sleep_until_ns; // what the timer is set to; UINT64_MAX: it is not
     uint8_t out[IO_OUT_FRAMES * FRAME];
     size_t out_at, out_size;
     uint8_t in[64 * FRAME];
@@ -140,6 +139,13 @@ static uint64_t next_deadline(const struct io_thread *thread, uint64_t now) {
     return thread->retry_ns && !io_ended(thread->bus) && thread->retry_ns < at_ns ? thread->retry_ns : at_ns;
 }
 
+// Makes an eventfd readable; it holds 2^64-2 such ones.
+static void signal_event(int fd) {
+    uint64_t one = 1;
+    ssize_t done = write(fd, &one, sizeof one);
+    (void)done;
+}
+
 // Makes an eventfd unreadable; there is no other reader.
 static void drain(int fd) {
     uint64_t count;
@@ -147,18 +153,28 @@ static void drain(int fd) {
     (void)done;
 }
 
-// Sleeps until the descriptor, a caller or the deadline wakes it; returns the descriptor's events.
+// Wakes the thread at AT_NS; UINT64_MAX: never. A timer that has expired is readable until it is set again.
+static void set_timer(struct io_thread *thread, uint64_t at_ns) {
+    if (at_ns == thread->sleep_until_ns)
+        return;
+    thread->sleep_until_ns = at_ns;
+    struct itimerspec timer = {0}; // at rest
+    if (at_ns != UINT64_MAX)
+        timer.it_value =
+            (struct timespec){.tv_sec = (time_t)(at_ns / NS_PER_S), .tv_nsec = (long)(at_ns % NS_PER_S)};
+    timerfd_settime(thread->timer_fd, TFD_TIMER_ABSTIME, &timer, NULL);
+}
+
+// Sleeps until the descriptor, a caller or the timer wakes it; returns the descriptor's events.
 static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
-    struct pollfd fds[2] = {{.fd = io_ended(thread->bus) ? -1 : thread->fd, .events = POLLIN},
-                            {.fd = thread->wake_fd, .events = POLLIN}};
+    struct pollfd fds[3] = {{.fd = io_ended(thread->bus) ? -1 : thread->fd, .events = POLLIN},
+                            {.fd = thread->wake_fd, .events = POLLIN},
+                            {.fd = thread->timer_fd, .events = POLLIN}};
     if (thread->kernel_full)
         fds[0].events |= POLLOUT;
-    thread->sleep_until_ns = next_deadline(thread, now);
-    uint64_t wait_ns = thread->sleep_until_ns > now ? thread->sleep_until_ns - now : 0;
-    struct timespec wait = {.tv_sec = (time_t)(wait_ns / NS_PER_S), .tv_nsec = (long)(wait_ns % NS_PER_S)};
-    thread->sleeping = 1;
+    set_timer(thread, next_deadline(thread, now));
     pthread_mutex_unlock(&thread->mutex);
-    ppoll(fds, 2, thread->sleep_until_ns == UINT64_MAX ? NULL : &wait, NULL); // on failure: no events
+    poll(fds, 3, -1); // on failure: no events
     if (fds[1].revents & POLLIN)
         drain(thread->wake_fd);
     pthread_mutex_lock(&thread->mutex);
@@ -173,7 +189,6 @@ static int overslept(const struct io_thread *thread, uint64_t now) {
 
 static void *run(void *argument) {
     struct io_thread *thread = argument;
-    prctl(PR_SET_TIMERSLACK, 1000UL); // the default of 50 µs would delay every timed send
     pthread_mutex_lock(&thread->mutex);
     short seen = POLLIN;
     while (!thread->stopping) {
@@ -191,12 +206,6 @@ static void *run(void *argument) {
     return NULL;
 }
 
-static void wake(struct io_thread *thread) {
-    uint64_t one = 1;
-    if (thread->sleeping && write(thread->wake_fd, &one, sizeof one) == sizeof one)
-        thread->sleeping = 0;
-}
-
 // -------------------------------------------------------------------------------------- what the core calls
 
 static uint64_t now_of(void *context) {
@@ -212,23 +221,22 @@ static void unlock(void *context) {
     pthread_mutex_unlock(&((struct io_thread *)context)->mutex);
 }
 
-// The caller sends what it queued itself, which saves the latency of waking the thread; the thread is woken
-// only when it has to wait for something new.
+// The caller sends what it queued itself and sets the thread's timer to a new deadline; the thread sleeps on,
+// and is woken only when it has to poll for something else.
 static void kick(void *context) {
     struct io_thread *thread = context;
-    if (!thread->sleeping)
-        return; // the thread is running, or about to, and will find what was queued
+    int was_full = thread->kernel_full, had_ended = io_ended(thread->bus);
     uint64_t now = monotonic_ns();
     write_all(thread, now);
-    if (io_ended(thread->bus) || thread->kernel_full || next_deadline(thread, now) < thread->sleep_until_ns)
-        wake(thread);
+    uint64_t at_ns = next_deadline(thread, now);
+    if (at_ns < thread->sleep_until_ns)
+        set_timer(thread, at_ns);
+    if (thread->kernel_full != was_full || io_ended(thread->bus) != had_ended)
+        signal_event(thread->wake_fd);
 }
 
-// An eventfd holds 2^64-2 such ones.
 static void notify(void *context) {
-    uint64_t one = 1;
-    ssize_t done = write(((struct io_thread *)context)->notice_fd, &one, sizeof one);
-    (void)done;
+    signal_event(((struct io_thread *)context)->notice_fd);
 }
 
 static void quiet(void *context) {
@@ -240,10 +248,10 @@ static void quiet(void *context) {
 static void forget(struct io_thread *thread) {
     if (thread->bus)
         io_free(thread->bus);
-    if (thread->wake_fd >= 0)
-        close(thread->wake_fd);
-    if (thread->notice_fd >= 0)
-        close(thread->notice_fd);
+    const int fds[] = {thread->wake_fd, thread->timer_fd, thread->notice_fd};
+    for (size_t i = 0; i < sizeof fds / sizeof *fds; i++)
+        if (fds[i] >= 0)
+            close(fds[i]);
     pthread_mutex_destroy(&thread->mutex);
     free(thread);
 }
@@ -266,11 +274,12 @@ struct io_thread *io_start(int fd, enum io_kind kind, const struct io_settings *
     thread->kind = kind;
     thread->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     thread->notice_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
+    thread->timer_fd = timerfd_create(CLOCK_MONOTONIC, TFD_NONBLOCK | TFD_CLOEXEC);
     thread->bus = io_new(kind, settings, &driver, thread);
     pthread_mutex_init(&thread->mutex, NULL);
     if (kind != IO_BYTES)
         bound_kernel_queue(fd);
-    if (thread->wake_fd < 0 || thread->notice_fd < 0 || !thread->bus ||
+    if (thread->wake_fd < 0 || thread->timer_fd < 0 || thread->notice_fd < 0 || !thread->bus ||
         pthread_create(&thread->thread, NULL, run, thread)) {
         forget(thread);
         return NULL;
@@ -281,7 +290,7 @@ struct io_thread *io_start(int fd, enum io_kind kind, const struct io_settings *
 void io_stop(struct io_thread *thread) {
     pthread_mutex_lock(&thread->mutex);
     thread->stopping = 1;
-    wake(thread);
+    signal_event(thread->wake_fd);
     pthread_mutex_unlock(&thread->mutex);
     pthread_join(thread->thread, NULL);
     forget(thread);

@@ -18,8 +18,8 @@
 #include <string.h>
 #include <sys/eventfd.h>
 #include <sys/ioctl.h>
-#include <sys/prctl.h>
 #include <sys/socket.h>
+#include <sys/timerfd.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -52,24 +52,30 @@ static struct kernel {
     int send_buffer;
     // Eventfds.
     int next_event_fd[2]; // what eventfd() returns; -1: it fails
+    int next_timer_fd;    // what timerfd_create() returns; -1: it fails
     unsigned event_calls;
     uint64_t count[EVENT_FDS];
     uint8_t is_open[EVENT_FDS];
     // The thread, its mutex, its memory and its sleep.
     uint8_t no_memory;
     int thread_error; // that pthread_create() gives
-    unsigned threads, slack_ns;
+    unsigned threads;
     pthread_t owner;
     uint8_t held, mutex_exists, is_joining;
     sem_t to_thread, to_test;
     struct pollfd *polled;
     short line_events; // what the thread sleeps for
     int line_fd;
-    int64_t timeout_ns; // -1: none
+    uint64_t timer_ns; // when the timer expires; UINT64_MAX: it is at rest
+    unsigned timer_calls;
 } kernel;
 
 static inline void kernel_reset(void) {
-    kernel = (struct kernel){.now_ns = 5123456789, .next_event_fd = {3, 4}, .send_buffer = -1};
+    kernel = (struct kernel){.now_ns = 5123456789,
+                             .next_event_fd = {3, 4},
+                             .next_timer_fd = 5,
+                             .send_buffer = -1,
+                             .timer_ns = UINT64_MAX};
     CHECK(sem_init(&kernel.to_thread, 0, 0) == 0 && sem_init(&kernel.to_test, 0, 0) == 0);
 }
 
@@ -146,34 +152,31 @@ static inline int kernel_thread_join(pthread_t thread, void **result) {
     return 0;
 }
 
-static inline int kernel_prctl(int option, unsigned long value) {
-    CHECK_EQUAL(option, PR_SET_TIMERSLACK);
-    kernel.slack_ns = (unsigned)value;
-    return 0;
-}
-
-static inline int kernel_ppoll(struct pollfd *fds, nfds_t size, const struct timespec *timeout,
-                               const sigset_t *mask) {
-    CHECK(size == 2 && !mask && !kernel.held && !kernel.is_joining);
-    CHECK_EQUAL(fds[1].events, POLLIN);
-    CHECK(count_of(fds[1].fd));
+static inline int kernel_poll(struct pollfd *fds, nfds_t size, int timeout_ms) {
+    CHECK(size == 3 && timeout_ms == -1 && !kernel.held && !kernel.is_joining);
+    CHECK(fds[1].events == POLLIN && fds[2].events == POLLIN);
+    CHECK(count_of(fds[1].fd) && count_of(fds[2].fd));
     kernel.polled = fds;
     kernel.line_fd = fds[0].fd;
     kernel.line_events = fds[0].events;
-    kernel.timeout_ns = timeout ? (int64_t)timeout->tv_sec * 1000000000 + timeout->tv_nsec : -1;
-    CHECK(!timeout || (timeout->tv_nsec >= 0 && timeout->tv_nsec < 1000000000));
     sem_post(&kernel.to_test);
     sem_wait(&kernel.to_thread);
-    return (fds[0].revents != 0) + (fds[1].revents != 0);
+    return (fds[0].revents != 0) + (fds[1].revents != 0) + (fds[2].revents != 0);
+}
+
+// After how long the sleeping thread wakes by itself; -1: never.
+static inline int64_t kernel_timeout_ns(void) {
+    return kernel.timer_ns == UINT64_MAX ? -1 : (int64_t)(kernel.timer_ns - kernel.now_ns);
 }
 
 // Ends the thread's sleep, with SEEN on the line, and returns when it sleeps again. Its wake-up is seen, too,
-// if it was woken; nothing of both: the time is up.
+// if it was woken, and its timer, if that has expired; nothing of all: poll() failed.
 static inline void kernel_turn(short seen) {
     CHECK(!seen || kernel.line_fd == LINE_FD);
     CHECK(!(seen & ~(kernel.line_events | POLLERR | POLLHUP)));
     kernel.polled[0].revents = seen;
     kernel.polled[1].revents = *count_of(kernel.polled[1].fd) ? POLLIN : 0;
+    kernel.polled[2].revents = kernel.timer_ns <= kernel.now_ns ? POLLIN : 0;
     kernel.read_calls = kernel.write_calls = kernel.queue_calls = 0;
     sem_post(&kernel.to_thread);
     sem_wait(&kernel.to_test);
@@ -181,8 +184,8 @@ static inline void kernel_turn(short seen) {
 
 // Lets time pass until the thread's sleep ends, and LATE_NS more.
 static inline void kernel_sleep_out(uint64_t late_ns) {
-    CHECK(kernel.timeout_ns >= 0);
-    kernel.now_ns += (uint64_t)kernel.timeout_ns + late_ns;
+    CHECK(kernel_timeout_ns() >= 0);
+    kernel.now_ns = kernel.timer_ns + late_ns;
     kernel_turn(0);
 }
 
@@ -203,6 +206,29 @@ static inline int kernel_eventfd(unsigned count, int flags) {
         kernel.is_open[fd] = 1;
     }
     return fd;
+}
+
+static inline int kernel_timerfd_create(clockid_t clock, int flags) {
+    CHECK_EQUAL(clock, CLOCK_MONOTONIC);
+    CHECK_EQUAL(flags, TFD_NONBLOCK | TFD_CLOEXEC);
+    if (kernel.next_timer_fd >= 0) {
+        CHECK(!kernel.is_open[kernel.next_timer_fd]);
+        kernel.is_open[kernel.next_timer_fd] = 1;
+    }
+    return kernel.next_timer_fd;
+}
+
+static inline int kernel_timerfd_settime(int fd, int flags, const struct itimerspec *timer,
+                                         struct itimerspec *old) {
+    CHECK(fd == kernel.next_timer_fd && count_of(fd) && !old && kernel_is_mine());
+    CHECK_EQUAL(flags, TFD_TIMER_ABSTIME);
+    CHECK(timer->it_interval.tv_sec == 0 && timer->it_interval.tv_nsec == 0);
+    CHECK(timer->it_value.tv_sec >= 0 && timer->it_value.tv_nsec >= 0 &&
+          timer->it_value.tv_nsec < 1000000000);
+    uint64_t at_ns = (uint64_t)timer->it_value.tv_sec * 1000000000 + (uint64_t)timer->it_value.tv_nsec;
+    kernel.timer_ns = at_ns ? at_ns : UINT64_MAX;
+    kernel.timer_calls++;
+    return 0;
 }
 
 static inline int kernel_close(int fd) {
@@ -308,8 +334,7 @@ static inline int kernel_setsockopt(int fd, int level, int option, const void *v
 #define eventfd kernel_eventfd
 #define getsockopt kernel_getsockopt
 #define ioctl kernel_ioctl
-#define ppoll kernel_ppoll
-#define prctl kernel_prctl
+#define poll kernel_poll
 #define pthread_create kernel_thread_create
 #define pthread_join kernel_thread_join
 #define pthread_mutex_destroy kernel_mutex_destroy
@@ -318,6 +343,8 @@ static inline int kernel_setsockopt(int fd, int level, int option, const void *v
 #define pthread_mutex_unlock kernel_mutex_unlock
 #define read kernel_read
 #define setsockopt kernel_setsockopt
+#define timerfd_create kernel_timerfd_create
+#define timerfd_settime kernel_timerfd_settime
 #define write kernel_write
 
 #endif

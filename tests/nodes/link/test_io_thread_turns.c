@@ -63,7 +63,7 @@ static struct io_stats stats_of(struct io_thread *thread) {
 static void check_sleep(short events, int64_t timeout_ns) {
     CHECK_EQUAL(kernel.line_fd, LINE_FD);
     CHECK_EQUAL(kernel.line_events, events);
-    CHECK_EQUAL(kernel.timeout_ns, timeout_ns);
+    CHECK_EQUAL(kernel_timeout_ns(), timeout_ns);
     CHECK(!kernel_is_woken());
 }
 
@@ -76,7 +76,7 @@ static void check_ended(struct io_thread *thread, int cause) {
     if (kernel_is_woken())
         kernel_turn(0);
     CHECK_EQUAL(kernel.line_fd, -1);
-    CHECK_EQUAL(kernel.timeout_ns, -1);
+    CHECK_EQUAL(kernel_timeout_ns(), -1);
     CHECK_EQUAL(send_frame(thread, 9), IO_CLOSED);
     CHECK_EQUAL(kernel.write_calls, 0);
 }
@@ -85,9 +85,8 @@ static void check_ended(struct io_thread *thread, int cause) {
 
 static void a_thread_starts_with_a_look_at_the_line_and_sleeps(enum io_kind kind) {
     struct io_thread *thread = start(kind, &unknown_speed);
-    CHECK_EQUAL(kernel.slack_ns, 1000);
     CHECK_EQUAL(kernel.threads, 1);
-    CHECK_EQUAL(kernel_open_fds(), 2);
+    CHECK_EQUAL(kernel_open_fds(), 3);
     CHECK_EQUAL(io_notice_fd(thread), 4);
     CHECK_EQUAL(kernel.send_buffer, kind == IO_BYTES ? -1 : 16 * KERNEL_BUFFER / 2); // 16 frames
     CHECK_EQUAL(kernel.read_calls, 1);
@@ -105,12 +104,14 @@ static void a_thread_starts_with_a_look_at_the_line_and_sleeps(enum io_kind kind
 // Descriptor 0 is as good as any: a program may have closed its standard input.
 static void a_start_that_fails_leaves_nothing_behind(void) {
     static const struct {
-        int wake_fd, notice_fd, thread_error, starts;
-    } cases[] = {{0, 4, 0, 1}, {3, 0, 0, 1}, {-1, 4, 0, 0}, {3, -1, 0, 0}, {-1, -1, 0, 0}, {3, 4, EAGAIN, 0}};
+        int wake_fd, notice_fd, timer_fd, thread_error, starts;
+    } cases[] = {{0, 4, 5, 0, 1},  {3, 0, 5, 0, 1},  {3, 4, 0, 0, 1},    {-1, 4, 5, 0, 0},
+                 {3, -1, 5, 0, 0}, {3, 4, -1, 0, 0}, {-1, -1, -1, 0, 0}, {3, 4, 5, EAGAIN, 0}};
     for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
         kernel_reset();
         kernel.next_event_fd[0] = cases[i].wake_fd;
         kernel.next_event_fd[1] = cases[i].notice_fd;
+        kernel.next_timer_fd = cases[i].timer_fd;
         kernel.thread_error = cases[i].thread_error;
         struct io_thread *thread = io_start(LINE_FD, IO_BYTES, &unknown_speed);
         CHECK_EQUAL(thread != NULL, cases[i].starts);
@@ -267,6 +268,7 @@ static void a_full_kernel_is_waited_for(enum io_kind kind, ssize_t size, int err
     CHECK_EQUAL(stats_of(thread).waits, 1);
     CHECK_EQUAL(send_frame(thread, 5), IO_OK);
     CHECK_EQUAL(kernel.write_calls, 0);
+    CHECK(!kernel_is_woken()); // it waits for the line already
     kernel_turn(POLLIN);
     CHECK(kernel.write_calls == 0 && kernel.read_calls == 1);
     kernel_turn(POLLOUT);
@@ -285,16 +287,12 @@ static void a_kernel_without_buffers_is_asked_again_later(void) {
     struct io_thread *thread = start(IO_CAN_PACKET, &unknown_speed);
     writing_gives(-1, ENOBUFS);
     CHECK_EQUAL(send_frame(thread, 1), IO_OK);
-    CHECK(kernel_is_woken());
-    CHECK_EQUAL(send_frame(thread, 2), IO_OK); // the thread is on its way
-    CHECK_EQUAL(kernel.write_calls, 1);
-    kernel_turn(0);
-    CHECK(kernel.write_calls == 0 && kernel.read_calls == 0);
-    check_sleep(POLLIN, 300000);
+    check_sleep(POLLIN, 300000); // it wakes by itself in time
+    CHECK_EQUAL(send_frame(thread, 2), IO_OK);
     kernel.now_ns += 299999;
     CHECK_EQUAL(send_frame(thread, 3), IO_OK);
-    CHECK_EQUAL(kernel.write_calls, 0);
-    CHECK(!kernel_is_woken()); // it wakes by itself in time
+    CHECK_EQUAL(kernel.write_calls, 1);
+    check_sleep(POLLIN, 1);
     kernel_turn(POLLIN);
     CHECK(kernel.write_calls == 0 && kernel.read_calls == 1);
     check_sleep(POLLIN, 1);
@@ -307,7 +305,7 @@ static void a_kernel_without_buffers_is_asked_again_later(void) {
 
     writing_gives(-1, ENOBUFS);
     CHECK_EQUAL(send_frame(thread, 4), IO_OK);
-    kernel_turn(0);
+    check_sleep(POLLIN, 300000);
     reading_gives(0, 0, NULL);
     kernel_turn(POLLIN);
     check_ended(thread, 0); // nothing is tried again
@@ -337,15 +335,12 @@ static void the_thread_sleeps_until_the_next_deadline(void) {
     CHECK_EQUAL(io_open_link(thread->bus, 0, &usual, &link), IO_OK);
     CHECK_EQUAL(io_send(thread->bus, link, LINK_CONTROL, (const uint8_t *)"\5", 1, 0, 0), IO_OK);
     CHECK_EQUAL(kernel.write_calls, 1);
-    CHECK(kernel_is_woken()); // there is a deadline now
-    kernel_turn(0);
-    CHECK_EQUAL(kernel.read_calls, 0);
     for (uint64_t wait_ms = 100; wait_ms <= 3200; wait_ms *= 2) {
         check_sleep(POLLIN, (int64_t)(wait_ms * MS));
         kernel.now_ns += MS;
         CHECK_EQUAL(io_send(thread->bus, link, LINK_CONTROL, (const uint8_t *)"\5", 1, 0, 0), IO_OK);
-        CHECK(!kernel_is_woken()); // the deadline is as before
         kernel.now_ns -= MS;
+        check_sleep(POLLIN, (int64_t)(wait_ms * MS)); // the deadline is as before
         kernel_sleep_out(0);
         CHECK_EQUAL(kernel.read_calls, 0);
         CHECK_EQUAL(kernel.write_calls, 1);
@@ -355,21 +350,22 @@ static void the_thread_sleeps_until_the_next_deadline(void) {
     stop(thread);
 }
 
-// A thread that is on its way finds what was queued meanwhile, and sends it together.
-static void a_thread_that_was_woken_sends_the_rest(void) {
+// A deadline that passes is seen once: the timer is set anew or comes to rest, and not set without need.
+static void the_timer_is_set_when_the_deadline_changes(void) {
     struct io_thread *thread = start(IO_CAN_STREAM, &unknown_speed);
-    uint32_t link;
-    CHECK_EQUAL(io_open_link(thread->bus, NODE, &usual, &link), IO_OK);
-    CHECK_EQUAL(io_send(thread->bus, link, LINK_CONTROL, (const uint8_t *)"\5", 1, 0, 0), IO_OK);
-    CHECK(kernel_is_woken()); // there is a deadline now
-    CHECK_EQUAL(kernel.write_calls, 1);
-    for (uint8_t i = 1; i <= 3; i++)
-        CHECK_EQUAL(send_frame(thread, i), IO_OK);
-    CHECK_EQUAL(kernel.write_calls, 1);
-    kernel.sent_size = 0;
-    kernel_turn(0);
-    CHECK_EQUAL(kernel.write_calls, 1);
-    check_sent((const uint8_t[]){1, 2, 3}, 3);
+    CHECK_EQUAL(kernel.timer_calls, 1); // to rest
+    CHECK_EQUAL(send_frame(thread, 1), IO_OK);
+    kernel_turn(POLLIN);
+    CHECK_EQUAL(kernel.timer_calls, 1);
+    writing_gives(-1, ENOBUFS);
+    CHECK_EQUAL(send_frame(thread, 2), IO_OK);
+    CHECK_EQUAL(kernel.timer_calls, 2);
+    kernel_turn(POLLIN);
+    CHECK_EQUAL(kernel.timer_calls, 2);
+    kernel_sleep_out(0);
+    check_sleep(POLLIN, -1);
+    CHECK_EQUAL(kernel.timer_calls, 3);
+    CHECK_EQUAL(stats_of(thread).wakeups, 3);
     stop(thread);
 }
 
@@ -379,7 +375,6 @@ static void a_thread_that_overslept_reads_first(void) {
     uint32_t link;
     CHECK_EQUAL(io_open_link(thread->bus, 0, &usual, &link), IO_OK);
     CHECK_EQUAL(io_send(thread->bus, link, LINK_CONTROL, (const uint8_t *)"\5", 1, 0, 0), IO_OK);
-    kernel_turn(0);
     kernel_sleep_out(2 * MS);
     CHECK_EQUAL(kernel.read_calls, 0);
     kernel_sleep_out(2 * MS + 1);
@@ -525,7 +520,7 @@ int main(void) {
     a_kernel_without_buffers_is_asked_again_later();
     a_line_may_end_while_it_is_written();
     the_thread_sleeps_until_the_next_deadline();
-    a_thread_that_was_woken_sends_the_rest();
+    the_timer_is_set_when_the_deadline_changes();
     a_thread_that_overslept_reads_first();
     what_is_read_has_the_time_of_its_read();
     a_sockets_buffers_are_counted_as_the_writes_they_hold();
