@@ -2,7 +2,7 @@
 
 A callback that calculates, or waits for a disk, holds everything that lives on the loop. A timer of the
 kernel is set whenever the loop begins to work and disarmed when it rests, so that watching costs two short
-calls of the system for each round, and wakes nobody while the loop is quick. It expires into a thread.
+calls of the system for each rest, and wakes nobody while the loop is quick. It expires into a thread.
 """
 
 import asyncio
@@ -96,7 +96,8 @@ class _WatchedSelector(selectors.DefaultSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         self.busy_since_s = 0.0
-        self.timer.disarm()
+        if timeout != 0:  # else it goes on at once, and the timer begins anew
+            self.timer.disarm()
         events = super().select(timeout)
         self.busy_since_s = time.monotonic()
         self.timer.arm()
