@@ -96,7 +96,7 @@ export class Stop {
       this.#send(press);
       press.later(DOUBT_MS, () => this.#request(press));
     } else {
-      this.#own.connect();
+      if (this.#key !== undefined) this.#own.connect(); // else it would only be refused
       this.#request(press);
     }
   }

@@ -14,7 +14,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, FilePayload, WebSocketRoute
+from playwright.sync_api import Browser, FilePayload, Route, WebSocketRoute
 
 from coordinator.ipc.protocol.methods import Scope
 from tests.coordinator.ipc.served import TOKENS, tokens_file
@@ -236,6 +236,27 @@ def test_a_stop_that_is_refused_says_so(browser: Browser, paged: Paged) -> None:
     tab.page.get_by_text("NOT stopped: machine.emergency_stop needs the scope operate").wait_for()
     assert paged.served.stops == []
     tab.close(NO_METHOD, FORBIDDEN)
+
+
+def test_a_stop_before_the_browser_is_signed_in_is_sent_when_it_is(browser: Browser, paged: Paged) -> None:
+    """It says that it was not sent; no connection is tried without a session, which would only be refused."""
+    paged.served.stops.clear()
+    tab = Visitor(browser)
+    logins: list[Route] = []
+
+    def keep(login: Route) -> None:
+        logins.append(login)
+
+    tab.page.route("**/login", keep)
+    tab.page.goto(link(paged))
+    tab.page.get_by_role("button", name="Emergency stop").click()
+    tab.page.get_by_text("NOT stopped: this browser is not signed in").wait_for()
+    assert not [url for url in tab.asked if url.endswith(("/socket", "/session"))]
+    (login,) = logins
+    login.continue_()
+    tab.page.get_by_text("All nodes were told to stop").wait_for()
+    assert set(paged.served.stops) == {"the live page (127.0.0.1)"}
+    tab.close(NO_METHOD, NOT_SIGNED_IN)
 
 
 def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, paged: Paged) -> None:
