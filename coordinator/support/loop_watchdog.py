@@ -96,7 +96,7 @@ class _WatchedSelector(selectors.DefaultSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         self.busy_since_s = 0.0
-        if timeout != 0:  # else it goes on at once, and the timer begins anew
+        if timeout != 0:  # else it goes on at once, and the timer is restarted
             self.timer.disarm()
         events = super().select(timeout)
         self.busy_since_s = time.monotonic()

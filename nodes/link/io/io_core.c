@@ -195,7 +195,7 @@ size_t io_take(struct io_bus *bus, struct io_event *out, size_t room) {
     taken += take_ring(&bus->unclaimed, out + taken, room - taken);
     taken += take_notices(bus, out + taken, room - taken);
     io_publish(bus);
-    if (taken < room && bus->noticed) {
+    if (taken < room) { // also without a notice: that of what is taken already may come late
         bus->noticed = 0;
         if (bus->driver.quiet)
             bus->driver.quiet(bus->context);

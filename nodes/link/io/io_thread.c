@@ -31,6 +31,7 @@ struct io_thread {
     pthread_t thread;
     pthread_mutex_t mutex;
     uint8_t stopping;
+    uint8_t notice_due;      // make notice_fd readable once the lock is free
     uint8_t kernel_full;     // wait until the descriptor is writable
     uint64_t retry_ns;       // when to try again after ENOBUFS; 0: not now
     uint64_t sleep_until_ns; // what the timer is set to; UINT64_MAX: it is not
@@ -153,12 +154,21 @@ static void drain(int fd) {
     (void)done;
 }
 
+// Gives the lock back, and notifies the program if that is due: one that is woken before waits for the lock.
+static void release(struct io_thread *thread) {
+    int notice_due = thread->notice_due;
+    thread->notice_due = 0;
+    pthread_mutex_unlock(&thread->mutex);
+    if (notice_due)
+        signal_event(thread->notice_fd);
+}
+
 // Wakes the thread at AT_NS; UINT64_MAX: never. A timer that has expired is readable until it is set again.
 static void set_timer(struct io_thread *thread, uint64_t at_ns) {
     if (at_ns == thread->sleep_until_ns)
         return;
     thread->sleep_until_ns = at_ns;
-    struct itimerspec timer = {0}; // at rest
+    struct itimerspec timer = {0}; // disarmed
     if (at_ns != UINT64_MAX)
         timer.it_value =
             (struct timespec){.tv_sec = (time_t)(at_ns / NS_PER_S), .tv_nsec = (long)(at_ns % NS_PER_S)};
@@ -173,7 +183,7 @@ static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
     if (thread->kernel_full)
         fds[0].events |= POLLOUT;
     set_timer(thread, next_deadline(thread, now));
-    pthread_mutex_unlock(&thread->mutex);
+    release(thread);
     poll(fds, 3, -1); // on failure: no events
     if (fds[1].revents & POLLIN)
         drain(thread->wake_fd);
@@ -202,7 +212,7 @@ static void *run(void *argument) {
         write_all(thread, now);
         seen = sleep_unlocked(thread, now);
     }
-    pthread_mutex_unlock(&thread->mutex);
+    release(thread);
     return NULL;
 }
 
@@ -218,7 +228,7 @@ static void lock(void *context) {
 }
 
 static void unlock(void *context) {
-    pthread_mutex_unlock(&((struct io_thread *)context)->mutex);
+    release(context);
 }
 
 // The caller sends what it queued itself and sets the thread's timer to a new deadline; the thread sleeps on,
@@ -236,7 +246,7 @@ static void kick(void *context) {
 }
 
 static void notify(void *context) {
-    signal_event(((struct io_thread *)context)->notice_fd);
+    ((struct io_thread *)context)->notice_due = 1;
 }
 
 static void quiet(void *context) {

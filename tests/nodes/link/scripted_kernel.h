@@ -66,7 +66,7 @@ static struct kernel {
     struct pollfd *polled;
     short line_events; // what the thread sleeps for
     int line_fd;
-    uint64_t timer_ns; // when the timer expires; UINT64_MAX: it is at rest
+    uint64_t timer_ns; // when the timer expires; UINT64_MAX: it is disarmed
     unsigned timer_calls;
 } kernel;
 
@@ -252,7 +252,11 @@ static inline ssize_t kernel_result(const struct step *step) {
 static inline ssize_t kernel_read(int fd, void *out, size_t room) {
     if (fd != LINE_FD) {
         uint64_t *count = count_of(fd);
-        CHECK(room == sizeof *count && *count > 0);
+        CHECK_EQUAL(room, sizeof *count);
+        if (!*count) {
+            errno = EAGAIN;
+            return -1;
+        }
         memcpy(out, count, sizeof *count);
         *count = 0;
         return sizeof *count;
@@ -283,6 +287,7 @@ static inline ssize_t kernel_write(int fd, const void *data, size_t size) {
         CHECK_EQUAL(size, sizeof added);
         memcpy(&added, data, sizeof added);
         CHECK_EQUAL(added, 1);
+        CHECK(fd != kernel.next_event_fd[1] || !kernel_is_mine()); // who is woken by it takes the lock
         *count_of(fd) += added;
         return sizeof added;
     }

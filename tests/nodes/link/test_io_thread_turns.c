@@ -186,6 +186,19 @@ static void the_line_is_read_until_it_is_empty(void) {
     stop(thread);
 }
 
+// The notice comes after the lock is free: who took the events by another occasion is told once more.
+static void a_late_notice_of_nothing_ends(void) {
+    struct io_thread *thread = start(IO_CAN_STREAM, &unknown_speed);
+    reading_gives(FRAME, 0, &a_frame);
+    kernel_turn(POLLIN);
+    check_frames(thread, 1);
+    kernel.count[4] = 1;
+    struct io_event event;
+    CHECK_EQUAL(io_take(thread->bus, &event, 1), 0);
+    CHECK_EQUAL(kernel.count[4], 0);
+    stop(thread);
+}
+
 static void a_flood_does_not_keep_the_thread_from_sending(void) {
     struct io_thread *thread = start(IO_CAN_PACKET, &unknown_speed);
     writing_gives(-1, EAGAIN);
@@ -350,10 +363,10 @@ static void the_thread_sleeps_until_the_next_deadline(void) {
     stop(thread);
 }
 
-// A deadline that passes is seen once: the timer is set anew or comes to rest, and not set without need.
+// A deadline that passes is seen once: the timer is set again or disarmed, and not set without need.
 static void the_timer_is_set_when_the_deadline_changes(void) {
     struct io_thread *thread = start(IO_CAN_STREAM, &unknown_speed);
-    CHECK_EQUAL(kernel.timer_calls, 1); // to rest
+    CHECK_EQUAL(kernel.timer_calls, 1); // disarmed
     CHECK_EQUAL(send_frame(thread, 1), IO_OK);
     kernel_turn(POLLIN);
     CHECK_EQUAL(kernel.timer_calls, 1);
@@ -509,6 +522,7 @@ int main(void) {
     a_thread_starts_with_a_look_at_the_line_and_sleeps(IO_CAN_PACKET);
     a_start_that_fails_leaves_nothing_behind();
     the_line_is_read_until_it_is_empty();
+    a_late_notice_of_nothing_ends();
     a_flood_does_not_keep_the_thread_from_sending();
     a_line_may_end_while_it_is_read();
     what_is_sent_goes_at_once(IO_CAN_STREAM);
