@@ -80,7 +80,7 @@ uint64_t schedule_queued(const struct schedule *schedule, uint64_t queued);
 // Returns how many frames may be passed on when QUEUED wait in the kernel (UINT64_MAX: unknown, estimated).
 uint64_t schedule_room(const struct schedule *schedule, uint64_t queued);
 
-// Returns when a frame of a full queue should have been sent, or a pause ends.
+// Returns when the frames of a full queue should have been sent, but for a few, or a pause ends.
 uint64_t schedule_room_at(const struct schedule *schedule);
 
 // Returns whether offer A goes before B at NOW. Overdue offers other than motion rank equally.

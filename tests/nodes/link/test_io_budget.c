@@ -140,9 +140,9 @@ static void the_budget_holds_bulk_back_until_it_is_paid(void) {
 // Where the kernel's queue is full, too, the sooner of both is waited for, and is to blame. Received frames
 // have used up all the credit that there can be, 50 ms: motion may be sent ahead again in 30 ms.
 static void a_full_queue_and_a_spent_budget_wait_for_the_sooner(void) {
-    static const struct io_settings settings = {.bitrate = 125000, .queue_frames = 62, .ceiling = 1.0};
+    static const struct io_settings settings = {.bitrate = 125000, .queue_frames = 34, .ceiling = 1.0};
     const uint64_t queue_ns = 31 * 960000,
-                   budget_ns = 30 * MS + 1; // half of the queue; all bits are given out
+                   budget_ns = 30 * MS + 1; // all but 3 of the queue; all bits are given out
     for (uint64_t later_ns = budget_ns - queue_ns - 1; later_ns <= budget_ns - queue_ns + 1; later_ns++) {
         struct scene scene;
         const uint8_t data[8] = {0};
@@ -157,7 +157,7 @@ static void a_full_queue_and_a_spent_budget_wait_for_the_sooner(void) {
         send_of(&scene, LINK_BULK, 1);
         send_of(&scene, LINK_CONTROL, 1); // of which a block may go at any time
         scene.now_ns += later_ns;
-        CHECK_EQUAL(one_round(&scene, ROOM, 62), 0);
+        CHECK_EQUAL(one_round(&scene, ROOM, 34), 0);
         int by_budget = budget_ns - later_ns < queue_ns;
         check_deadline(&scene, by_budget ? budget_ns - later_ns : queue_ns);
         struct io_stats stats;
@@ -169,7 +169,7 @@ static void a_full_queue_and_a_spent_budget_wait_for_the_sooner(void) {
     }
 }
 
-// What waits for the queue alone: for as long as half of it lasts. Nothing waits: for nothing.
+// What waits for the queue alone: until 3 frames are left. Nothing waits: for nothing.
 static void a_full_queue_is_waited_for_only_with_something_to_send(void) {
     struct scene scene;
     uint8_t data = 0;
@@ -180,14 +180,14 @@ static void a_full_queue_is_waited_for_only_with_something_to_send(void) {
     CHECK_EQUAL(bus_stats(&scene).queue_waits, 0);
     CHECK_EQUAL(io_send_frame(scene.bus, TO_PYTHON_ID, &data, 1), IO_OK);
     CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
-    check_deadline(&scene, 6 * 120000);
+    check_deadline(&scene, 9 * 120000);
     CHECK_EQUAL(one_round(&scene, ROOM, 11), FRAME); // sooner than it was to be
     CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
     check_deadline(&scene, UINT64_MAX - scene.now_ns); // that wait is over
     CHECK_EQUAL(bus_stats(&scene).queue_waits, 1);
     send_of(&scene, LINK_CONTROL, 1);
     CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
-    check_deadline(&scene, 6 * 120000);
+    check_deadline(&scene, 9 * 120000);
     CHECK_EQUAL(bus_stats(&scene).queue_waits, 2);
     io_free(scene.bus);
 }

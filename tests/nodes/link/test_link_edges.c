@@ -307,7 +307,7 @@ static void the_kernels_queue_is_filled_and_no_more(void) {
     CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 9, out, sizeof out), 3 * FRAME);
     CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 12, out, sizeof out), 0);
     CHECK(io_deadline(scene.bus, scene.now_ns) > scene.now_ns);
-    CHECK_EQUAL(io_deadline(scene.bus, scene.now_ns), scene.now_ns + 6 * 120 * 1000); // half of them
+    CHECK_EQUAL(io_deadline(scene.bus, scene.now_ns), scene.now_ns + 9 * 120 * 1000); // all but 3
     struct io_stats stats;
     io_get_stats(scene.bus, &stats);
     CHECK_EQUAL(stats.queued_max, 12);

@@ -207,12 +207,17 @@ static void frames_that_wait_are_rounded_up(void) {
     CHECK_EQUAL(schedule_room(&schedule, 7), 0);
 }
 
-// Half of the queue, rounded up, has left when it is looked at again.
-static void a_full_queue_is_looked_at_when_half_has_left(void) {
+// Half of the queue, rounded up, has left when it is looked at again; of a long one all but 3 frames, which
+// keep the bus busy meanwhile.
+static void a_full_queue_is_looked_at_before_it_is_empty(void) {
     struct schedule schedule = bus(BITRATE, 0, 5, 0);
     CHECK_EQUAL(schedule_room_at(&schedule), S + 3 * FRAME_NS);
     schedule = bus(BITRATE, 0, 6, 0);
     CHECK_EQUAL(schedule_room_at(&schedule), S + 3 * FRAME_NS);
+    schedule = bus(BITRATE, 0, 7, 0);
+    CHECK_EQUAL(schedule_room_at(&schedule), S + 4 * FRAME_NS);
+    schedule = bus(BITRATE, 0, 8, 0);
+    CHECK_EQUAL(schedule_room_at(&schedule), S + 5 * FRAME_NS);
     schedule = bus(BITRATE, 0, 1, 0);
     CHECK_EQUAL(schedule_room_at(&schedule), S + FRAME_NS);
     schedule = bus(0, 0, 5, 0);
@@ -330,7 +335,7 @@ int main(void) {
     a_serial_line_pays_nothing_for_what_it_receives();
     the_time_held_back_goes_on();
     frames_that_wait_are_rounded_up();
-    a_full_queue_is_looked_at_when_half_has_left();
+    a_full_queue_is_looked_at_before_it_is_empty();
     the_pause_begins_and_ends_to_the_nanosecond();
     deadlines_order_what_is_not_overdue();
     a_rate_is_of_the_time_that_was_seen();
