@@ -100,6 +100,11 @@ class Module:
     def end(self, cause: str) -> None:
         """Stop acting because of CAUSE; may be called more than once."""
 
+    @property
+    def controls(self) -> bool:
+        """Whether it acts now on what sensors measure, so that no measurement may be late."""
+        return False
+
     def status(self) -> Mapping[str, Value]:
         """Return its status, for macros and front ends: quickly, and never changed afterwards."""
         return {}

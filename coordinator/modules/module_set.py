@@ -403,6 +403,11 @@ class ModuleSet:
         """Get ready for steps of STEPPERS, which follow no sooner than a start from standstill takes."""
         self._motors.on(steppers)
 
+    @property
+    def controls(self) -> bool:
+        """Whether any of them acts now on what sensors measure."""
+        return any(module.controls for module in self._modules)
+
     def stopped(self, cause: str) -> None:
         """Inform all modules that the machine is stopped."""
         if self._live is not None:

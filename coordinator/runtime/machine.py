@@ -78,6 +78,8 @@ class Modules(Protocol):
     def node_started(self, node: Node) -> None: ...  # noqa: D102
     async def connect(self, machine: "Machine", say: Callable[[str], None]) -> None: ...  # noqa: D102
     def before_motion(self, steppers: Collection[str]) -> None: ...  # noqa: D102
+    @property
+    def controls(self) -> bool: ...  # noqa: D102
     def job_begins(self) -> None: ...  # noqa: D102
     def stopped(self, cause: str) -> None: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
@@ -343,6 +345,12 @@ class Machine:
                     functools.partial(_repeated, opened.bus),
                     functools.partial(_taken, opened.bus),
                 )
+
+    def let_measurements_wait(self) -> None:
+        """Let what sensors measure wait as long as nothing acts on it; call it again and again."""
+        wait = not self.modules.controls
+        for node in self.nodes.values():
+            node.let_measurements_wait(wait=wait)
 
     def is_busy(self, load: float) -> bool:
         """Return whether a bus has carried more than LOAD lately, a share of its time."""

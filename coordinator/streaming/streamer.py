@@ -79,6 +79,8 @@ class Streamer:
         self._delay_s = 0.0
         """How long cycles have lately taken at most until their commands were handed over: motion on a slow
         computer needs as much more lead."""
+        self._busy = False
+        """Whether a bus is busy, as of the last cycle."""
         self._pause: asyncio.Future[None] | None = None
         """Between two cycles."""
         self.cycles = 0
@@ -201,7 +203,7 @@ class Streamer:
             return CYCLE_S
         ahead_s = self.worker.steps.generated_until - self.print_time_now()
         if isinstance(cycle.event, Full) and ahead_s > SEND_AHEAD_S - CYCLE_S:
-            return BUSY_CYCLE_S if self._machine.is_busy(BUSY_LOAD) else FULL_CYCLE_S
+            return BUSY_CYCLE_S if self._busy else FULL_CYCLE_S
         if isinstance(cycle.event, StandstillAction) and self._standstill is not None:
             return REST_CYCLE_S
         stands_s = cycle.planned.stands_from_s
@@ -214,6 +216,7 @@ class Streamer:
         """Wait PAUSE_S, or until ``call``."""
         if self._called:
             return
+        self._machine.let_measurements_wait()
         loop = asyncio.get_running_loop()
         self._pause = loop.create_future()
         ends_s = loop.time() + pause_s
@@ -282,8 +285,8 @@ class Streamer:
         self._set_start_lead()
 
     def _set_start_lead(self) -> None:
-        busy = self._machine.is_busy(BUSY_LOAD)
-        self.worker.start_lead_s = (BUSY_START_LEAD_S if busy else START_LEAD_S) + self._delay_s
+        self._busy = self._machine.is_busy(BUSY_LOAD)
+        self.worker.start_lead_s = (BUSY_START_LEAD_S if self._busy else START_LEAD_S) + self._delay_s
 
     async def _settle(self, thread: ThreadPoolExecutor) -> None:
         """Bring what is left to the nodes and wait until the last step is executed."""

@@ -89,6 +89,8 @@ class _WatchedSelector(selectors.DefaultSelector):
         self.timer = _Timer(LOOK_S, AGAIN_S)
         self.busy_since_s = 0.0
         """When the loop began to work; 0: it rests."""
+        self.when_awake: list[Callable[[], None]] = []
+        """What is called after each rest."""
 
     def close(self) -> None:
         super().close()
@@ -101,7 +103,22 @@ class _WatchedSelector(selectors.DefaultSelector):
         events = super().select(timeout)
         self.busy_since_s = time.monotonic()
         self.timer.arm()
+        if timeout != 0:
+            for call in tuple(self.when_awake):
+                call()
         return events
+
+
+class _Flexible:
+    """Something that is called from a time on, when the loop is awake."""
+
+    __slots__ = ("call", "earliest_s", "handle")
+
+    def __init__(self, earliest_s: float, call: Callable[[], None]) -> None:
+        self.earliest_s = earliest_s
+        self.call = call
+        self.handle: asyncio.Handle
+        """Wakes the loop at the latest time; then of the call itself."""
 
 
 class WatchedLoop(asyncio.SelectorEventLoop):
@@ -111,7 +128,50 @@ class WatchedLoop(asyncio.SelectorEventLoop):
 
     def __init__(self) -> None:
         self.watched = _WatchedSelector()
+        self._flexible: list[_Flexible] = []
         super().__init__(self.watched)
+        self.when_awake(self._call_what_has_time)
+
+    def when_awake(self, call: Callable[[], None]) -> Callable[[], None]:
+        """Call CALL whenever the loop has woken up, before all else; return what ends that.
+
+        It must be quick and not raise; what it has to do is for ``call_soon``.
+        """
+        self.watched.when_awake.append(call)
+
+        def end() -> None:
+            self.watched.when_awake.remove(call)
+
+        return end
+
+    def call_between(
+        self, earliest_s: float, latest_s: float, call: Callable[[], None]
+    ) -> Callable[[], None]:
+        """Call CALL once, when the loop is awake anyway between two of its times, else at the later one.
+
+        Return what cancels it.
+        """
+        flexible = _Flexible(earliest_s, call)
+        self._flexible.append(flexible)
+
+        def end() -> None:
+            flexible.handle.cancel()
+            if flexible in self._flexible:
+                self._flexible.remove(flexible)
+
+        def call_late() -> None:
+            end()
+            call()
+
+        flexible.handle = self.call_at(latest_s, call_late)
+        return end
+
+    def _call_what_has_time(self) -> None:
+        now_s = self.time()
+        for flexible in [flexible for flexible in self._flexible if flexible.earliest_s <= now_s]:
+            flexible.handle.cancel()
+            self._flexible.remove(flexible)
+            flexible.handle = self.call_soon(flexible.call)
 
     def pending_signals(self) -> list[int]:
         """Return the numbers of the signals that came and were not handled yet; from any thread."""

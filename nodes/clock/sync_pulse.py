@@ -17,6 +17,7 @@ from nodes.clock.clock import HostTime, Ticks, extend32
 from nodes.clock.estimated_clock import EstimatedClock
 from nodes.clock.pulse_fit import PAIRS_MAX, PulseFit, PulseLine
 from nodes.dictionary.message_format import Message
+from nodes.support.awake import sleep_between
 from nodes.support.can_protocol import ADMIN_ID, SYNC_PULSE
 from nodes.support.errors import CanductorError
 
@@ -26,6 +27,8 @@ SETTLE_ROUNDS: Final = 40
 SETTLE_INTERVAL_S: Final = 0.05
 INTERVAL_S: Final = 0.933
 """Not a divisor of a second: periodic work on a node must not meet every pulse."""
+SLACK: Final = 0.1
+"""By how much of the time between two pulses the next may be later."""
 IDLE_S: Final = 0.25
 """Interval of the checks for two capable nodes."""
 ANSWER_TIMEOUT_S: Final = 0.2
@@ -174,7 +177,14 @@ class PulseNode(Protocol):
         ...
 
     async def query(
-        self, name: str, response: str, /, *, timeout_s: float = ..., tries: int = ...
+        self,
+        name: str,
+        response: str,
+        /,
+        *,
+        timeout_s: float = ...,
+        tries: int = ...,
+        patient: bool = ...,
     ) -> Message:
         """Query the node."""
         ...
@@ -211,7 +221,8 @@ class PulseKeeper:
             with contextlib.suppress(CanductorError):  # the bus closes: that is reported elsewhere
                 await self._round(nodes)
             self._publish(nodes)
-            await asyncio.sleep(SETTLE_INTERVAL_S if self.rounds.settling else INTERVAL_S)
+            pause_s = SETTLE_INTERVAL_S if self.rounds.settling else INTERVAL_S
+            await sleep_between(pause_s, pause_s * (1 + SLACK))
 
     async def _round(self, nodes: Sequence[PulseNode]) -> None:
         seq = self.rounds.next_pulse({node.name: node.clock_freq_hz for node in nodes})
@@ -220,7 +231,13 @@ class PulseKeeper:
 
     async def _ask(self, node: PulseNode) -> None:
         with contextlib.suppress(CanductorError):  # the answer or the node is lost: it misses this round
-            answer = await node.query("get_sync_pulse", "sync_pulse", timeout_s=ANSWER_TIMEOUT_S, tries=1)
+            answer = await node.query(
+                "get_sync_pulse",
+                "sync_pulse",
+                timeout_s=ANSWER_TIMEOUT_S,
+                tries=1,
+                patient=not self.rounds.settling,
+            )
             near = node.clock.ticks_at(self._now())
             self.rounds.answer(node.name, answer.integer("seq"), answer.integer("clock"), near)
 

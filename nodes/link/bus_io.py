@@ -114,6 +114,7 @@ class LinkIO:
             on_responses=on_responses,
             on_lost=on_lost,
             on_close=self._links.pop,
+            take=self._handle_events,
         )
         self._links[number[0]] = link
         return link

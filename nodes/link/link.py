@@ -28,8 +28,11 @@ class Link:
         on_responses: OnResponses,
         on_lost: OnLost,
         on_close: Callable[[int], object],
+        take: Callable[[], None],
     ) -> None:
         self._on_close = on_close
+        self.take = take
+        """Hands over at once what has arrived on the bus, so that nothing of it waits."""
         self._bus = bus
         self._lib, self._ffi = bus.lib, bus.ffi
         self._number = number
@@ -102,6 +105,21 @@ class Link:
                 f"{self._name}: not a clock: {freq_hz} Hz at {at_ns} ns, {at_ticks} ticks; estimate it again"
             )
         self._check(self._lib.io_set_clock(self._live(), self._number, freq_hz, at_ns, at_ticks))
+
+    def let_wait(self, message_id: bytes, seconds: float) -> None:
+        """From now on let responses with MESSAGE_ID (as on the wire) wait for others, up to SECONDS; 0: not.
+
+        What may wait wakes the loop only when it has waited. Raises LinkError when too many may.
+        """
+        content, wait_ns = self._ffi.from_buffer(message_id), round(seconds * 1e9)
+        status = self._lib.io_let_wait(self._live(), self._number, content, len(message_id), wait_ns)
+        if status in (self._lib.IO_FULL, self._lib.IO_INVALID):
+            raise LinkError(f"{self._name}: no room to let responses with the id {message_id.hex()} wait")
+        self._check(status)
+
+    def hurry(self, *, hurry: bool) -> None:
+        """Let no response wait while HURRY; raises LinkError."""
+        self._check(self._lib.io_hurry(self._live(), self._number, hurry))
 
     def pending(self) -> int:
         """Return how many commands are not yet acknowledged, queued ones included."""

@@ -8,6 +8,7 @@ from typing import Any
 from nodes.link._link import ffi as _ffi
 from nodes.link._link import lib as _lib
 from nodes.link.types import BusSettings, LinkError, LinkTransport, TransportKind
+from nodes.support.awake import WakingLoop
 
 
 class ThreadDriver:
@@ -21,6 +22,7 @@ class ThreadDriver:
         self.ffi = _ffi
         self.lib = _lib
         self._loop = loop
+        self._look_no_more: Callable[[], None] = _nothing
         os.set_blocking(transport.fileno(), False)
         line = _ffi.new("struct io_settings *", settings.as_dict())
         self._thread: Any = _lib.io_start(transport.fileno(), int(transport.kind), line)
@@ -30,10 +32,25 @@ class ThreadDriver:
         self._notice_fd: int = _lib.io_notice_fd(self._thread)
 
     def listen(self, handler: Callable[[], None]) -> None:
-        """Call HANDLER in the loop's thread when io_take() has something."""
+        """Call HANDLER in the loop's thread when io_take() has something.
+
+        What may wait is taken when the loop is awake anyway, if it says so.
+        """
         self._loop.add_reader(self._notice_fd, handler)
+
+        def look() -> None:
+            if _lib.io_waits(self.bus):
+                self._loop.call_soon(handler)
+
+        if isinstance(self._loop, WakingLoop):
+            self._look_no_more = self._loop.when_awake(look)
 
     def close(self) -> None:
         """Join the thread and free the bus."""
+        self._look_no_more()
         self._loop.remove_reader(self._notice_fd)
         _lib.io_stop(self._thread)
+
+
+def _nothing() -> None:
+    """Do nothing."""

@@ -40,6 +40,7 @@ class TableNode(Protocol):
         *,
         timeout_s: float = ...,
         tries: int = ...,
+        patient: bool = ...,
         **args: Value | str,
     ) -> Message: ...
 

@@ -2,12 +2,17 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from typing import Final
 
 from nodes.clock.clock import ClockEstimate, ClockEstimator
 from nodes.clock.wire_time import narrow
 from nodes.node.connector import ClockConnector
 from nodes.node.request_reply import Answer, QueryTimeout, RequestReply
+from nodes.support.awake import sleep_between
 from nodes.support.errors import CanductorError
+
+SLACK: Final = 0.1
+"""By how much of the time between two samples the next may be later."""
 
 
 class ClockKeeper:
@@ -61,7 +66,8 @@ class ClockKeeper:
             except CanductorError as error:
                 self._on_lost(str(error))
                 return
-            await asyncio.sleep(self.estimator.next_sample_ns(0) * 1e-9)
+            pause_s = self.estimator.next_sample_ns(0) * 1e-9
+            await sleep_between(pause_s, pause_s * (1 + SLACK))
 
     def _sampled(self, answer: Answer) -> None:
         if not self._take(answer):
@@ -74,7 +80,7 @@ class ClockKeeper:
 
     async def _ask(self) -> Answer:
         if self.estimator.accepted:
-            return await self._talk.ask("get_clock", "clock", tries=1, survives_shutdown=True)
+            return await self._talk.ask("get_clock", "clock", tries=1, survives_shutdown=True, patient=True)
         return await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
 
     def _take(self, answer: Answer) -> bool:

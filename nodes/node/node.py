@@ -36,7 +36,11 @@ ALIVE_TIMEOUT_S: Final = 0.1
 """Time for a node to prove that it is alive when another board claims its identity."""
 CLOCK_TIMEOUT_S: Final = 15.0
 """On a bus that loses one frame in twenty, every fourth sample is lost or unusable."""
-
+PATIENCE_S: Final = {"clock": 0.1, "sync_pulse": 0.1, "config": 1.0, "uptime": 1.0, "stats": 1.0}
+"""How long responses that come all the time may wait until something else wakes the host."""
+MEASURED: Final = "analog_in_state"
+MEASURED_PATIENCE_S: Final = 1.0
+"""The same of what sensors measure while nothing acts on it."""
 
 ClockSource = Literal["pulse", "exchange"]
 OnState = Callable[["Node"], None]
@@ -182,19 +186,28 @@ class Node:
         *,
         timeout_s: float = QUERY_TIMEOUT_S,
         tries: int = QUERY_TRIES,
+        patient: bool = False,
         **args: Value | str,
     ) -> Message:
         """Send a command and return its RESPONSE (of the same oid); repeat the command when it gets lost.
 
+        The answer to a PATIENT question may come later than it could.
+
         Raises QueryTimeout, or NodeLost or NodeShutdown when that happens meanwhile.
         """
         self._check_usable()
-        answer = await self._talk.ask(name, response, args, timeout_s=timeout_s, tries=tries)
+        answer = await self._talk.ask(name, response, args, timeout_s=timeout_s, tries=tries, patient=patient)
         return answer.message
 
     def on(self, response: str, oid: int | None, callback: Callback) -> Callable[[], None]:
         """Call CALLBACK for every RESPONSE (of OID, unless None); return a function that ends it."""
         return self._talk.on(response, oid, callback)
+
+    def let_measurements_wait(self, *, wait: bool) -> None:
+        """Let what sensors measure WAIT from now on, or not, as when the node has started."""
+        if self.talks:
+            with contextlib.suppress(CanductorError):  # the link is lost
+                self._talk.let_wait(MEASURED, MEASURED_PATIENCE_S if wait else 0.0)
 
     def explain_shutdown(self, explain: ExplainShutdown) -> None:
         """Have EXPLAIN add to the sentence of a shutdown, until the node is started again."""
@@ -258,6 +271,8 @@ class Node:
         self.reset_first, self.was_reached = "", True
         await self._configure(found, wanted)
         await self._wait_for_clock(keeper)
+        for response, seconds in PATIENCE_S.items():
+            self._talk.let_wait(response, seconds)
         self._enter(NodeEvent.CONFIGURED)
 
     async def _prepare(self) -> tuple[ClockKeeper, NodeConfig, Message]:

@@ -5,7 +5,7 @@ Used on the control loop only. Responses can get lost, so a query is repeated.
 
 import asyncio
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -53,15 +53,16 @@ class _Waiter:
 
 
 class _Exchange:
-    """Calls SEND until WAITERS have their answers, up to TRIES times, TIMEOUT_S apart.
+    """Sends CONTENT on LINK until WAITERS have their answers, up to TRIES times, TIMEOUT_S apart.
 
     A timer does this, not a task that waits: an answer wakes only the task that asked.
     """
 
     def __init__(
-        self, send: Callable[[], None], waiters: Sequence[_Waiter], timeout_s: float, tries: int
+        self, link: LinkInterface, content: bytes, waiters: Sequence[_Waiter], timeout_s: float, tries: int
     ) -> None:
-        self._send = send
+        self._link = link
+        self._content = content
         self._answers = [waiter.answered for waiter in waiters]
         self._timeout_s = timeout_s
         self._left = tries
@@ -70,10 +71,11 @@ class _Exchange:
     def send(self) -> None:
         """Send, and again after the time-out."""
         self._left -= 1
-        self._send()
+        self._link.send(self._content)
         self._timer = asyncio.get_running_loop().call_later(self._timeout_s, self._expire)
 
     def _expire(self) -> None:
+        self._link.take()  # an answer that came in time may still wait
         pending = [answer for answer in self._answers if not answer.done()]
         if self._left and pending:
             try:
@@ -108,12 +110,17 @@ class RequestReply:
         self._link: LinkInterface | None = None
         self._waiters: list[_Waiter] = []
         self._listeners: dict[tuple[str, int | None], list[Callback]] = {}
+        self._patience_s: dict[str, float] = {}
+        """How long responses may wait for others while nobody is in a hurry."""
+        self._hurried = 0
+        """Exchanges whose answers are wanted at once."""
 
     # ------------------------------------------------------------------------------------------------ link
 
     def attach(self, link: LinkInterface) -> None:
         """Use LINK from now on, with only the messages that identify a node."""
         self._link = link
+        self._patience_s.clear()
         self.dictionary = BOOTSTRAP
 
     def detach(self) -> LinkInterface | None:
@@ -132,6 +139,32 @@ class RequestReply:
         if self._link is None:
             raise QueryTimeout(f"node {self.name} has no connection")
         return self._link
+
+    def let_wait(self, response: str, seconds: float) -> None:
+        """Let RESPONSE, if the firmware has it, wait for others up to SECONDS while nobody is in a hurry.
+
+        A program that is woken for each single one does little else. Ends with the link.
+        """
+        known = self.dictionary.responses.get(response)
+        if known is not None and self._patience_s.get(response, 0.0) != seconds:
+            self._patience_s[response] = seconds
+            self.link.let_wait(known.prefix, seconds)
+
+    @contextmanager
+    def _hurrying(self) -> Iterator[None]:
+        """Let no response wait meanwhile."""
+        self._hurried += 1
+        try:
+            self._tell_hurry()
+            yield
+        finally:
+            self._hurried -= 1
+            with suppress(CanductorError):  # the link is lost
+                self._tell_hurry()
+
+    def _tell_hurry(self) -> None:
+        if self._patience_s:
+            self.link.hurry(hurry=self._hurried > 0)
 
     # ------------------------------------------------------------------------------------------------ send
 
@@ -163,11 +196,13 @@ class RequestReply:
         timeout_s: float = QUERY_TIMEOUT_S,
         tries: int = QUERY_TRIES,
         survives_shutdown: bool = False,
+        patient: bool = False,
     ) -> Answer:
         """Send a command with ARGS until its RESPONSE arrives with the values of MATCHING (the oid, if None).
 
         Raises QueryTimeout after TRIES times TIMEOUT_S, MessageError when the firmware lacks either message,
-        and any error given to ``fail`` meanwhile. With SURVIVES_SHUTDOWN a shutdown does not end the wait.
+        and any error given to ``fail`` meanwhile. With SURVIVES_SHUTDOWN a shutdown does not end the wait. A
+        PATIENT question has time: its answer may come as late as those of ``let_wait``.
         """
         args = args or {}
         content = self.encode(name, **args)
@@ -175,7 +210,7 @@ class RequestReply:
         if matching is None:
             matching = {"oid": args["oid"]} if "oid" in args and "oid" in format_.names else {}  # type: ignore[dict-item]
         waiter = self._waiter(response, len(content), matching, survives_shutdown=survives_shutdown)
-        with self._asking(content, [waiter], timeout_s, tries):
+        with self._asking(content, [waiter], timeout_s, tries, patient=patient):
             answer = await waiter.answered
         if answer is None:
             raise QueryTimeout(f"node {self.name} did not answer {name} within {tries * timeout_s:g} s")
@@ -185,13 +220,13 @@ class RequestReply:
         """Send QUERIES, commands without arguments and their responses, once and in one block.
 
         Return the answers; None for one that does not arrive in QUERY_TIMEOUT_S. A shutdown of the node does
-        not end the wait. Raises as ``ask``, but for QueryTimeout.
+        not end the wait. The question is patient. Raises as ``ask``, but for QueryTimeout.
         """
         content = b"".join(self.encode(name) for name, _ in queries)
         for name, response in queries:
             self._response_to(name, response)
         waiters = [self._waiter(r, len(content), {}, survives_shutdown=True) for _, r in queries]
-        with self._asking(content, waiters, QUERY_TIMEOUT_S, tries=1):
+        with self._asking(content, waiters, QUERY_TIMEOUT_S, tries=1, patient=True):
             return [await waiter.answered for waiter in waiters]
 
     def _response_to(self, name: str, response: str) -> MessageFormat:
@@ -209,18 +244,21 @@ class RequestReply:
 
     @contextmanager
     def _asking(
-        self, content: bytes, waiters: Sequence[_Waiter], timeout_s: float, tries: int
+        self, content: bytes, waiters: Sequence[_Waiter], timeout_s: float, tries: int, *, patient: bool
     ) -> Iterator[None]:
         """Send CONTENT, up to TRIES times, TIMEOUT_S apart; WAITERS without an answer get None at the end."""
         if len(self._waiters) + len(waiters) > MAX_WAITERS:
             raise QueryTimeout(
                 f"node {self.name}: {len(self._waiters)} queries are unanswered; one more was not sent"
             )
-        exchange = _Exchange(lambda: self.link.send(content), waiters, timeout_s, tries)
+        if patient:
+            timeout_s = max(timeout_s, *(self._patience_s.get(waiter.name, 0.0) for waiter in waiters))
+        exchange = _Exchange(self.link, content, waiters, timeout_s, tries)
         self._waiters += waiters
         try:
-            exchange.send()
-            yield
+            with nullcontext() if patient else self._hurrying():
+                exchange.send()
+                yield
         finally:
             exchange.close()
             for waiter in waiters:

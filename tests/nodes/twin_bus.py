@@ -16,7 +16,7 @@ from typing import Any
 from nodes.bus.assign import Uuid
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
-from nodes.link import BusLoad, Forecast, Frame, IOStats, LinkSettings, Response
+from nodes.link import BusLoad, Forecast, Frame, IOStats, LinkError, LinkSettings, Response
 from nodes.link.interfaces import OnFrame, OnLost, OnResponses
 from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 
@@ -192,6 +192,12 @@ class TwinLink:
         self.clocks: list[tuple[float, int, int]] = []
         self.sent: list[tuple[bytes, int, int]] = []
         self.on_silent: Callable[[], None] = lambda: None
+        self.patience_s: dict[bytes, float] = {}
+        self.hurries: list[bool] = []
+        self.waiting: deque[Response] = deque()
+        """What has arrived and is handed over when it is asked for."""
+        self.failure: LinkError | None = None
+        """What it raises when it is told of patience or hurry."""
 
     def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False) -> None:
         assert not self.closed
@@ -241,6 +247,22 @@ class TwinLink:
 
     def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None:
         self.clocks.append((freq_hz, at_ns, at_ticks))
+
+    def let_wait(self, message_id: bytes, seconds: float) -> None:
+        self._check()
+        self.patience_s[message_id] = seconds
+
+    def hurry(self, *, hurry: bool) -> None:
+        self._check()
+        self.hurries.append(hurry)
+
+    def take(self) -> None:
+        while self.waiting:
+            self.on_responses([self.waiting.popleft()])
+
+    def _check(self) -> None:
+        if self.failure is not None:
+            raise self.failure
 
     def close(self) -> None:
         self.closed = True

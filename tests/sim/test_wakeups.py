@@ -3,16 +3,22 @@
 import asyncio
 from pathlib import Path
 
+from coordinator.modules.heaters.sections import HeaterBed
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from coordinator.streaming.streamer import FULL_CYCLE_S, REST_CYCLE_S
 from coordinator.streaming.worker import SEND_AHEAD_S
+from nodes.devices.analog_in import REPORT_S
+from nodes.node.node import MEASURED_PATIENCE_S
+from tests.stages.printer import Printer, gcode
 from tests.stages.served import Served, running, zigzag
 
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
 REST_S = 10.0
 SCRIPT_S = 0.005
 """In virtual time, which does not pass while anything is computed: a wait for the next cycle would show."""
+SOON_S = 0.03
+"""A measurement takes some 10 ms, and its way."""
 SETTLE_S = 1.5
 """Until the tree is not read any more."""
 
@@ -64,3 +70,37 @@ def test_nothing_is_polled(tmp_path: Path) -> None:
 
     with asyncio.Runner(loop_factory=world.make_loop) as runner:
         runner.run(go())
+
+
+def test_measurements_wait_only_while_nothing_acts_on_them(tmp_path: Path) -> None:
+    printer = Printer(tmp_path)
+
+    async def go(stage: Served) -> None:
+        machine, motion = stage.service.machine, stage.service.motion
+        assert machine is not None
+        assert motion is not None
+        bed = machine.modules.find("heater_bed", HeaterBed)
+        assert bed is not None
+        ages_s: list[float] = []
+        act = bed.unit.input.on_measured
+
+        def measured(at_s: float, celsius: float) -> None:
+            ages_s.append(motion.now_s - at_s)
+            act(at_s, celsius)
+
+        bed.unit.input.on_measured = measured
+
+        async def oldest_s() -> float:
+            await asyncio.sleep(REST_CYCLE_S + MEASURED_PATIENCE_S)  # until it is known whether it is on
+            ages_s.clear()
+            await asyncio.sleep(5.0)
+            assert len(ages_s) > 5.0 / REPORT_S - 5, "none is lost"
+            return max(ages_s)
+
+        for _ in range(2):
+            assert MEASURED_PATIENCE_S / 2 < await oldest_s() < MEASURED_PATIENCE_S + SOON_S
+            await gcode(stage, "M140 S60")
+            assert await oldest_s() < SOON_S
+            await gcode(stage, "M140 S0")
+
+    printer.serve(go)

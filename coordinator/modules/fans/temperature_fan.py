@@ -166,6 +166,11 @@ class TemperatureFan(FanModule):
         where = f"check node {self.input.node} and its wires" if self.input.node else "find out why"
         live.say(f"[{self.name}] runs at its highest speed: its sensor is silent; {where}")
 
+    @property
+    def controls(self) -> bool:
+        """Whether it has a target."""
+        return self.target_c > 0
+
     def status(self) -> Mapping[str, Value]:
         """Report the fan and the temperature."""
         celsius = self.input.celsius

@@ -192,6 +192,11 @@ class Heater:
             self._apply(0.0)
 
     @property
+    def controls(self) -> bool:
+        """Whether it has a target, or is calibrated."""
+        return self.target_c > 0 or self._tuning is not None
+
+    @property
     def settled(self) -> bool:
         """Whether a command that waits for the target may go on."""
         if self.target_c <= 0 or self.controller is None or self.input.celsius is None:
@@ -329,7 +334,7 @@ class Heater:
     def _look(self) -> None:
         """Check that there still are measurements; stop the machine, or switch off, if there are none."""
         live = self._live
-        if live is None or (self.target_c <= 0 and self._tuning is None):
+        if live is None or not self.controls:
             return
         for name in (self.input.node, self.node):
             if live.node(name).state is not NodeState.READY:

@@ -56,6 +56,11 @@ class HeaterRegistry(Module):
         ):
             build.add_command(name, help_, read)
 
+    @property
+    def controls(self) -> bool:
+        """Whether a heater is on."""
+        return any(unit.controls for unit in self.units.values())
+
     def add(self, unit: Heater, tag: str = "") -> None:
         """Register a heater; TAG is its name in M105."""
         self.units[unit.key] = unit

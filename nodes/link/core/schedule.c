@@ -198,13 +198,12 @@ int schedule_pause(struct schedule *schedule, uint64_t since_ns) {
 uint64_t schedule_room_at(const struct schedule *schedule) {
     if (schedule->pause_ns)
         return schedule->pause_ns;
-    // Until it is half empty, or longer, while QUEUE_FRAMES_MIN keep the bus busy: each wait wakes the
-    // thread.
-    uint64_t half = (schedule->queue_frames + 1) / 2;
-    uint64_t most =
-        schedule->serial || half < QUEUE_FRAMES_MIN ? half : schedule->queue_frames - QUEUE_FRAMES_MIN;
-    uint64_t frames = most > half ? most : half;
-    return schedule->now_ns + (schedule->bitrate ? unit_ns(schedule) * frames : NS_PER_MS);
+    // Until half is left, or as little as keeps the bus busy meanwhile: each wait wakes the thread.
+    uint64_t left = schedule->queue_frames / 2;
+    if (!schedule->serial && left > QUEUE_FRAMES_MIN)
+        left = QUEUE_FRAMES_MIN;
+    uint64_t wait_ns = schedule->bitrate ? unit_ns(schedule) * (schedule->queue_frames - left) : NS_PER_MS;
+    return schedule->now_ns + wait_ns;
 }
 
 // --------------------------------------------------------------------------------------------------- order

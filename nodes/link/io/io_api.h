@@ -33,7 +33,7 @@
 // thread, all functions of this header may be called from any thread at any time between io_start() and
 // io_stop(). Functions of io_core.h require the lock; link.h, schedule.h and queue.h have no lock and
 // require that of their bus. Counters are the exception: io_get_stats() and io_get_link_stats()
-// take no lock and never wait; they are never older than what io_take() has returned.
+// take no lock and never wait; they are never older than what io_take() has returned. Nor does io_waits().
 //
 // RE-ENTRY. The core calls the driver's kick, notify and quiet under the lock, from within the call that
 // caused them: they must not call functions of this header for the same bus, and must not block. (The
@@ -85,6 +85,8 @@ enum {
     IO_RESPONSES_MAX = 4096,    // ring of responses, per bus
     IO_FRAMES_MAX = 1024,       // ring of received frames that belong to no link, per bus
     IO_ADMIN_MAX = 256,         // queue of frames to send that belong to no link, per bus
+    IO_PATIENT_MAX = 8,         // message ids of responses that may wait, per link
+    IO_ID_MAX = 5,              // bytes of such an id
 };
 
 enum io_status { IO_OK, IO_FULL, IO_INVALID, IO_GONE, IO_CLOSED, IO_TAKEN, IO_NO_MEMORY };
@@ -134,6 +136,10 @@ struct io_stats {
 // Fewer than ROOM: the driver notifies when there are more.
 size_t io_take(struct io_bus *bus, struct io_event *out, size_t room);
 
+// Returns whether io_take() has something that may wait, so that the driver has not notified yet. Takes no
+// lock: a program that is awake for another reason asks, and is not woken once more.
+int io_waits(const struct io_bus *bus);
+
 // Returns the value of IO_ENDED, for a caller that got IO_CLOSED before it took that event.
 int32_t io_end_cause(struct io_bus *bus);
 
@@ -152,6 +158,15 @@ enum io_status io_send_urgent(struct io_bus *bus, uint32_t number, const uint8_t
 enum io_status io_set_receive_window(struct io_bus *bus, uint32_t number, uint64_t size);
 enum io_status io_set_clock(struct io_bus *bus, uint32_t number, double freq_hz, uint64_t at_ns,
                             uint64_t at_ticks);
+
+// From now on responses that begin with the message id ID may wait for others, for WAIT_NS at most: the
+// driver does not notify of them alone before. 0: they may not, as at first. IO_INVALID: no id; IO_FULL: too
+// many.
+enum io_status io_let_wait(struct io_bus *bus, uint32_t number, const uint8_t *id, size_t size,
+                           uint64_t wait_ns);
+
+// While HURRY is not 0 no response that is received waits.
+enum io_status io_hurry(struct io_bus *bus, uint32_t number, int hurry);
 
 // Sets the bit rate of the bus if io_settings did not contain it, or a wrong one: budget and forecast start
 // again. 0: nothing is budgeted.

@@ -26,6 +26,12 @@ struct io_segment {
     uint32_t content;              // bytes
 };
 
+// Responses that begin with an id and may wait.
+struct io_patience {
+    uint8_t id[IO_ID_MAX], size;
+    uint64_t wait_ns; // for so long
+};
+
 // Published counters, read without a lock: SEQUENCE is odd while they are written.
 struct io_snapshot {
     uint64_t sequence;
@@ -45,8 +51,10 @@ struct io_link {
     uint64_t silences;       // of the link, that were reported
     uint8_t cut[IO_CUT_MAX]; // bytes of blocks that are being split into frames
     size_t cut_at, cut_size;
-    struct link_offer cut_offer; // of the newest block in there
-    uint8_t changed;             // since its counters were published
+    struct link_offer cut_offer;                 // of the newest block in there
+    uint8_t changed;                             // since its counters were published
+    struct io_patience patience[IO_PATIENT_MAX]; // those of size 0 are free
+    uint8_t in_a_hurry;                          // none of them counts now
     struct io_snapshot *snapshot;
     struct io_flow flows[LINK_CLASSES], received;
     struct io_segment segments[IO_SEGMENTS];
@@ -72,6 +80,7 @@ struct io_bus {
     uint64_t hold_ns;                   // when delayed data may be sent; UINT64_MAX: there is none
     double motion_bits, motion_content; // bits and bytes of motion so far, for the forecast
     uint8_t noticed;                    // the driver was notified that io_take() has something
+    uint64_t notice_ns;                 // when it is notified of what may wait; UINT64_MAX: nothing does
     uint8_t ended;                      // the transport has ended
     uint8_t ended_pending;              // an IO_ENDED is due
     int32_t ended_errno;
@@ -95,8 +104,9 @@ struct io_bus {
 void io_lock(struct io_bus *bus);
 void io_unlock(struct io_bus *bus);
 void io_notify(struct io_bus *bus);
-void io_push(struct io_bus *bus, struct io_ring *ring, const struct io_event *event, uint64_t *dropped,
-             uint64_t *most);
+// Notifies WAIT_NS after NOW, unless io_take() is called before; 0: at once.
+void io_notify_by(struct io_bus *bus, uint64_t now, uint64_t wait_ns);
+void io_push(struct io_ring *ring, const struct io_event *event, uint64_t *dropped, uint64_t *most);
 void io_note_states(struct io_bus *bus); // records state changes that Python has to be notified of
 
 // io_receive.c: processes bytes of one node; without bytes, only the timeout of an incomplete block.

@@ -21,7 +21,7 @@ struct io_bus *io_new(enum io_kind kind, const struct io_settings *settings, con
         return NULL;
     bus->kind = kind;
     bus->driver = *driver;
-    bus->hold_ns = UINT64_MAX;
+    bus->hold_ns = bus->notice_ns = UINT64_MAX;
     bus->context = context;
     bus->settings = *settings;
     schedule_init(&bus->schedule, settings->bitrate, settings->ceiling, settings->queue_frames,
@@ -99,6 +99,8 @@ void io_handle_time(struct io_bus *bus, uint64_t now) {
     }
     if (bus->hold_ns <= now) // io_next() follows, or the driver waits for another event
         bus->hold_ns = UINT64_MAX;
+    if (bus->notice_ns <= now)
+        io_notify(bus);
     io_publish(bus);
     io_note_states(bus);
 }
@@ -109,20 +111,35 @@ uint64_t io_deadline(const struct io_bus *bus, uint64_t now) {
         uint64_t link_ns = link_deadline(&bus->links[i]->link, now, bus->allowed);
         at_ns = link_ns < at_ns ? link_ns : at_ns;
     }
-    return at_ns;
+    return bus->notice_ns < at_ns ? bus->notice_ns : at_ns;
 }
 
 // ----------------------------------------------------------------------------------------------- for Python
+
+static void set_notice(struct io_bus *bus, uint64_t at_ns) {
+    __atomic_store_n(&bus->notice_ns, at_ns, __ATOMIC_RELAXED);
+}
 
 void io_notify(struct io_bus *bus) {
     if (bus->noticed)
         return;
     bus->noticed = 1;
+    set_notice(bus, UINT64_MAX);
     bus->driver.notify(bus->context);
 }
 
-void io_push(struct io_bus *bus, struct io_ring *ring, const struct io_event *event, uint64_t *dropped,
-             uint64_t *most) {
+void io_notify_by(struct io_bus *bus, uint64_t now, uint64_t wait_ns) {
+    if (wait_ns == 0)
+        io_notify(bus);
+    else if (!bus->noticed && now + wait_ns < bus->notice_ns)
+        set_notice(bus, now + wait_ns);
+}
+
+int io_waits(const struct io_bus *bus) {
+    return __atomic_load_n(&bus->notice_ns, __ATOMIC_RELAXED) != UINT64_MAX;
+}
+
+void io_push(struct io_ring *ring, const struct io_event *event, uint64_t *dropped, uint64_t *most) {
     if (ring->count == ring->size) {
         ring->first = (ring->first + 1) % ring->size;
         ring->count--;
@@ -131,7 +148,6 @@ void io_push(struct io_bus *bus, struct io_ring *ring, const struct io_event *ev
     ring->events[(ring->first + ring->count++) % ring->size] = *event;
     if (ring->count > *most)
         *most = ring->count;
-    io_notify(bus);
 }
 
 void io_note_states(struct io_bus *bus) {
@@ -197,6 +213,7 @@ size_t io_take(struct io_bus *bus, struct io_event *out, size_t room) {
     io_publish(bus);
     if (taken < room) { // also without a notice: that of what is taken already may come late
         bus->noticed = 0;
+        set_notice(bus, UINT64_MAX);
         if (bus->driver.quiet)
             bus->driver.quiet(bus->context);
     }

@@ -143,6 +143,43 @@ enum io_status io_set_clock(struct io_bus *bus, uint32_t number, double freq_hz,
     return leave(bus, status);
 }
 
+// Returns where the patience for ID is or may be kept; NULL: there is no room.
+static struct io_patience *place_of(struct io_link *node, const uint8_t *id, size_t size) {
+    struct io_patience *free = NULL;
+    for (size_t i = 0; i < IO_PATIENT_MAX; i++) {
+        struct io_patience *patience = &node->patience[i];
+        if (patience->size == size && memcmp(patience->id, id, size) == 0)
+            return patience;
+        if (!patience->size)
+            free = patience;
+    }
+    return free;
+}
+
+enum io_status io_let_wait(struct io_bus *bus, uint32_t number, const uint8_t *id, size_t size,
+                           uint64_t wait_ns) {
+    if (size == 0 || size > IO_ID_MAX)
+        return IO_INVALID;
+    enum io_status status;
+    struct io_link *node = enter(bus, number, &status);
+    struct io_patience *patience = node ? place_of(node, id, size) : NULL;
+    if (patience) {
+        *patience = (struct io_patience){.size = wait_ns ? (uint8_t)size : 0, .wait_ns = wait_ns};
+        memcpy(patience->id, id, size);
+    } else if (node) {
+        status = IO_FULL;
+    }
+    return leave(bus, status);
+}
+
+enum io_status io_hurry(struct io_bus *bus, uint32_t number, int hurry) {
+    enum io_status status;
+    struct io_link *node = enter(bus, number, &status);
+    if (node)
+        node->in_a_hurry = hurry != 0;
+    return leave(bus, status);
+}
+
 enum io_status io_watch_drained(struct io_bus *bus, uint32_t number) {
     enum io_status status;
     struct io_link *node = enter(bus, number, &status);

@@ -6,6 +6,17 @@
 
 enum { FROM_NODE = 1 };
 
+// How long a response may wait for others.
+static uint64_t patience_with(const struct io_link *node, const struct link_response *response) {
+    for (size_t i = 0; i < IO_PATIENT_MAX && !node->in_a_hurry; i++) {
+        const struct io_patience *patience = &node->patience[i];
+        if (patience->size && patience->size <= response->size &&
+            memcmp(response->content, patience->id, patience->size) == 0)
+            return patience->wait_ns;
+    }
+    return 0;
+}
+
 void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, size_t size, uint64_t now) {
     struct link_response response;
     size_t waiting = node->link.rx_used;
@@ -15,7 +26,8 @@ void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, s
         event.sent_ns = response.sent_ns;
         event.received_ns = response.received_ns;
         memcpy(event.content, response.content, response.size);
-        io_push(bus, &bus->responses, &event, &bus->stats.responses_dropped, &bus->stats.responses_max);
+        io_push(&bus->responses, &event, &bus->stats.responses_dropped, &bus->stats.responses_max);
+        io_notify_by(bus, now, patience_with(node, &response));
     }
     node->changed |=
         node->link.rx_used != waiting; // also without new bytes: an incomplete block may have been given up
@@ -49,7 +61,8 @@ static void receive_frame(struct io_bus *bus, const struct can_frame *frame, uin
     struct io_event event = {.notice = IO_FRAME, .size = frame->can_dlc, .can_id = frame->can_id};
     event.received_ns = now;
     memcpy(event.content, frame->data, frame->can_dlc);
-    io_push(bus, &bus->unclaimed, &event, &bus->stats.frames_dropped, &bus->stats.unclaimed_max);
+    io_push(&bus->unclaimed, &event, &bus->stats.frames_dropped, &bus->stats.unclaimed_max);
+    io_notify(bus);
 }
 
 // The first bytes of a frame may have been received before.

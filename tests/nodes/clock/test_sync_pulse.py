@@ -309,6 +309,8 @@ class FakeNode:
         self.pulse_clock: PulseClock | None = None
         self.latched = (0, 0)
         self.lost = False
+        self.patient: list[bool] = []
+        """Whether each question had time."""
         self._bus = bus
         self._rate = clock_freq_hz * (1 + ppm * 1e-6)
         self._start = start
@@ -327,7 +329,17 @@ class FakeNode:
     def ns_at(self, ticks: Ticks, /) -> HostTime:
         return HostTime(round(((ticks - self._start) / self._rate - 100e-6) * 1e9))
 
-    async def query(self, name: str, response: str, /, *, timeout_s: float = 1.0, tries: int = 1) -> Message:
+    async def query(
+        self,
+        name: str,
+        response: str,
+        /,
+        *,
+        timeout_s: float = 1.0,
+        tries: int = 1,
+        patient: bool = False,
+    ) -> Message:
+        self.patient.append(patient)
         assert (name, response, timeout_s, tries) == ("get_sync_pulse", "sync_pulse", 0.2, 1)
         if self.lost or self._bus.random.random() < self._bus.loss:
             await asyncio.sleep(timeout_s)
@@ -377,6 +389,15 @@ def test_a_follower_agrees_with_the_reference_whatever_the_host_believes(loss: f
 
     keep(bus, 5.0, look, look, look)
     assert max(map(abs, errors)) < 0.5e-6
+
+
+def test_answers_are_urgent_until_the_clocks_are_known() -> None:
+    bus = Bus(1, 0.0)
+    nodes = two_nodes(bus)
+    keep(bus, 5.0)
+    for node in nodes:
+        assert node.patient[: SETTLE_ROUNDS - 1] == [False] * (SETTLE_ROUNDS - 1)
+        assert all(node.patient[SETTLE_ROUNDS:]), "and then they have time"
 
 
 def test_a_lost_node_gives_up_its_clock_and_a_lonely_one_gets_no_pulses() -> None:

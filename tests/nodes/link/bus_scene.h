@@ -28,6 +28,7 @@ struct scene {
     struct wire_scanner scanner;
     unsigned expected; // the node's next sequence
     unsigned blocks;   // that the node took
+    int notices;       // that the program was given
 };
 
 static inline uint64_t now_of(void *context) {
@@ -38,13 +39,17 @@ static inline void nothing(void *context) {
     (void)context;
 }
 
+static inline void count_notice(void *context) {
+    ((struct scene *)context)->notices++;
+}
+
 static inline uint16_t id_of(unsigned node) {
     return (uint16_t)(DATA_ID + 2 * node);
 }
 
 static inline void open(struct scene *scene, enum io_kind kind, unsigned node,
                         const struct io_settings *settings) {
-    static const struct io_driver driver = {now_of, nothing, nothing, nothing, nothing, NULL};
+    static const struct io_driver driver = {now_of, nothing, nothing, nothing, count_notice, NULL};
     *scene = (struct scene){.now_ns = 1000 * MS, .kind = kind, .node = node};
     scene->bus = io_new(kind, settings, &driver, scene);
     CHECK(scene->bus);

@@ -344,3 +344,52 @@ def test_full_queues_and_bad_arguments_are_refused_in_words() -> None:
                     b.io.open_link(settings, on_responses=b.inbox.on_responses, on_lost=b.inbox.on_lost)
 
     run(test())
+
+
+class Waking(asyncio.SelectorEventLoop):
+    """A loop that says when it is awake, when the test says so."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.looks: list[Callable[[], None]] = []
+
+    def when_awake(self, call: Callable[[], None]) -> Callable[[], None]:
+        self.looks.append(call)
+        return lambda: self.looks.remove(call)
+
+    def call_between(
+        self, earliest_s: float, latest_s: float, call: Callable[[], None]
+    ) -> Callable[[], None]:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_may_wait_is_taken_when_the_loop_is_awake_or_asked_for(kind: TransportKind) -> None:
+    async def test() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, Waking)
+        with bench(kind, {node_id(kind): NodeTwin()}) as b:
+            link = b.open(node_id(kind))
+            (look,) = loop.looks
+            link.let_wait(answer(1)[:1], 3600.0)
+            for count in (1, 2):
+                link.send(ask(count))
+                async with asyncio.timeout(TIMEOUT_S):
+                    while not b.io._lib.io_waits(b.io._bus.live()):  # noqa: ASYNC110  nothing tells of it
+                        await asyncio.sleep(0.001)
+                assert len(b.inbox.responses) == count - 1
+                if count == 1:
+                    look()
+                    await asyncio.sleep(0)
+                else:
+                    link.take()
+                assert len(b.inbox.responses) == count
+            link.hurry(hurry=True)
+            link.send(ask(3))
+            await b.inbox.until(lambda: len(b.inbox.responses) == 3)
+            with pytest.raises(LinkError, match="no room to let responses with the id  wait"):
+                link.let_wait(b"", 1.0)
+        assert loop.looks == []
+
+    with asyncio.Runner(loop_factory=Waking) as runner:
+        runner.run(test())

@@ -6,23 +6,10 @@ import pytest
 
 from nodes.dictionary.message_format import MessageError
 from nodes.node.errors import NodeLost, NodeShutdown
-from nodes.node.request_reply import QUERY_TIMEOUT_S, Answer, RequestReply
+from nodes.node.request_reply import QUERY_TIMEOUT_S
 from tests.nodes import virtual_time
-from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode
-
-BOTH = (("get_config", "config"), ("get_uptime", "uptime"))
-
-
-class Bench:
-    def __init__(self) -> None:
-        self.twin = TwinNode()
-        self.talk = RequestReply("mainboard")
-        self.link = TwinLink(TwinIO([self.twin]), self.twin, self.talk.receive, lambda _: None)
-        self.talk.attach(self.link)
-        self.talk.dictionary = self.twin.dictionary
-
-    async def ask(self) -> list[Answer | None]:
-        return await self.talk.ask_together(BOTH)
+from tests.nodes.node.talk_bench import BOTH, TalkBench
+from tests.nodes.twin_bus import DELAY_S
 
 
 def now_s() -> float:
@@ -30,11 +17,11 @@ def now_s() -> float:
 
 
 def test_one_block_asks_all_and_each_answer_says_what_was_asked() -> None:
-    bench = Bench()
+    bench = TalkBench()
 
     async def main() -> None:
         before_s = now_s()
-        answers = await bench.ask()
+        answers = await bench.talk.ask_together(BOTH)
         assert now_s() - before_s == pytest.approx(2 * DELAY_S, abs=1e-6)
         assert [answer and answer.message.name for answer in answers] == ["config", "uptime"]
         [(content, _, _)] = bench.link.sent
@@ -45,12 +32,12 @@ def test_one_block_asks_all_and_each_answer_says_what_was_asked() -> None:
 
 
 def test_what_is_not_answered_in_time_is_none_and_is_not_asked_again() -> None:
-    bench = Bench()
+    bench = TalkBench()
 
     async def main() -> None:
         bench.twin.alive = False
         before_s = now_s()
-        asking = asyncio.ensure_future(bench.ask())
+        asking = asyncio.ensure_future(bench.talk.ask_together(BOTH))
         await asyncio.sleep(0.1)
         bench.link.say(bench.twin.response("uptime", high=0, clock=5))
         answers = await asking
@@ -63,12 +50,12 @@ def test_what_is_not_answered_in_time_is_none_and_is_not_asked_again() -> None:
 
 
 def test_a_shutdown_ends_no_question_and_a_loss_ends_both() -> None:
-    bench, bugs = Bench(), list[dict[str, object]]()
+    bench, bugs = TalkBench(), list[dict[str, object]]()
 
     async def main() -> None:
         asyncio.get_running_loop().set_exception_handler(lambda _, context: bugs.append(context))
         bench.twin.alive = False
-        asking = asyncio.ensure_future(bench.ask())
+        asking = asyncio.ensure_future(bench.talk.ask_together(BOTH))
         await asyncio.sleep(0.01)
         bench.talk.fail(NodeShutdown("it stopped"), shutdown=True)
         await asyncio.sleep(0.01)
@@ -82,7 +69,7 @@ def test_a_shutdown_ends_no_question_and_a_loss_ends_both() -> None:
 
 
 def test_a_message_that_the_firmware_lacks_is_not_asked_for() -> None:
-    bench = Bench()
+    bench = TalkBench()
 
     async def main() -> None:
         with pytest.raises(MessageError, match="no response 'weather' to get_config"):

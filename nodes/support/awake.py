@@ -1,0 +1,42 @@
+"""What has time until an event loop is awake anyway: a computer that rests is woken once for all of it."""
+
+import asyncio
+import functools
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+
+@runtime_checkable
+class WakingLoop(Protocol):
+    """An event loop that says when it is awake."""
+
+    def when_awake(self, call: Callable[[], None], /) -> Callable[[], None]:
+        """Call CALL whenever the loop has woken up; return what ends that."""
+
+    def call_between(
+        self, earliest_s: float, latest_s: float, call: Callable[[], None], /
+    ) -> Callable[[], None]:
+        """Call CALL once, when the loop is awake anyway between two of its times, else at the later one.
+
+        Return what cancels it.
+        """
+
+
+def call_between(earliest_s: float, latest_s: float, call: Callable[[], None]) -> Callable[[], None]:
+    """Do the same with the running loop; one that does not say when it is awake calls at the earlier time."""
+    loop = asyncio.get_running_loop()
+    if isinstance(loop, WakingLoop):
+        return loop.call_between(earliest_s, latest_s, call)
+    return loop.call_at(earliest_s, call).cancel
+
+
+async def sleep_between(least_s: float, most_s: float) -> None:
+    """Sleep for LEAST_S, and until the loop is awake anyway, MOST_S at most; see ``call_between``."""
+    loop = asyncio.get_running_loop()
+    over = loop.create_future()
+    now_s = loop.time()
+    cancel = call_between(now_s + least_s, now_s + most_s, functools.partial(over.set_result, None))
+    try:
+        await over
+    finally:
+        cancel()

@@ -1,0 +1,114 @@
+"""The control loop says when it is awake, and what has time is done then."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+
+import pytest
+
+from coordinator.support.loop_watchdog import WatchedLoop
+from nodes.support.awake import call_between, sleep_between
+
+NEVER_S = 3600.0
+
+
+def run(test: Callable[[WatchedLoop], Coroutine[object, object, None]]) -> None:
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, WatchedLoop)
+        await test(loop)
+
+    with asyncio.Runner(loop_factory=WatchedLoop) as runner:
+        runner.run(main())
+
+
+def test_who_asked_is_called_when_the_loop_wakes() -> None:
+    async def test(loop: WatchedLoop) -> None:
+        done: list[str] = []
+
+        def look() -> None:
+            loop.call_soon(done.append, "what was waiting")
+
+        end = loop.when_awake(look)
+        for _ in range(3):
+            await asyncio.sleep(0)
+        assert done == [], "it did not rest"
+        loop.call_later(0.001, done.append, "what woke it")
+        await asyncio.sleep(0.002)
+        assert done[:2] == ["what was waiting", "what woke it"]
+        end()
+        done.clear()
+        await asyncio.sleep(0.001)
+        assert done == []
+
+    run(test)
+
+
+def test_what_has_time_is_done_once_when_the_loop_is_awake() -> None:
+    async def test(loop: WatchedLoop) -> None:
+        done: list[str] = []
+        now_s = loop.time()
+        call_between(now_s, now_s + NEVER_S, lambda: done.append("it may"))
+        call_between(now_s + NEVER_S, now_s + NEVER_S, lambda: done.append("too early"))
+        for _ in range(3):
+            await asyncio.sleep(0.001)
+        assert done == ["it may"]
+
+    run(test)
+
+
+def test_what_has_time_wakes_the_loop_at_the_latest() -> None:
+    async def test(loop: WatchedLoop) -> None:
+        came = asyncio.Event()
+        begun_s = loop.time()
+        call_between(begun_s + 0.001, begun_s + 0.002, came.set)
+        async with asyncio.timeout(NEVER_S):
+            await came.wait()
+        assert loop.time() - begun_s >= 0.001
+        begun_s = loop.time()
+        await sleep_between(0.001, 0.002)
+        assert loop.time() - begun_s >= 0.001
+        assert loop._flexible == []
+
+    run(test)
+
+
+def test_the_later_time_needs_no_other_occasion() -> None:
+    """Nobody asks the loop whether it is awake: as when the computer slept past both times."""
+
+    async def test(loop: WatchedLoop) -> None:
+        came = asyncio.Event()
+        loop.watched.when_awake.clear()
+        call_between(loop.time(), loop.time() + 0.001, came.set)
+        async with asyncio.timeout(NEVER_S):
+            await came.wait()
+        assert loop._flexible == []
+
+    run(test)
+
+
+def test_what_is_cancelled_is_not_done_not_even_in_the_same_turn() -> None:
+    async def test(loop: WatchedLoop) -> None:
+        done: list[str] = []
+        now_s = loop.time()
+        cancel = call_between(now_s, now_s + NEVER_S, lambda: done.append("cancelled before"))
+        cancel()
+        ends: list[Callable[[], None]] = []
+
+        def cancel_the_next() -> None:
+            ends[0]()
+
+        call_between(now_s, now_s + NEVER_S, cancel_the_next)
+        ends.append(call_between(now_s, now_s + NEVER_S, lambda: done.append("cancelled by the other")))
+        await asyncio.sleep(0.001)
+        cancel_the_next()
+        assert done == []
+        assert loop._flexible == []
+
+        sleeping = asyncio.ensure_future(sleep_between(0.0, NEVER_S))
+        await asyncio.sleep(0)
+        loop.call_soon(sleeping.cancel)
+        with pytest.raises(asyncio.CancelledError):
+            await sleeping
+        assert loop._flexible == []
+
+    run(test)
