@@ -9,9 +9,13 @@ from coordinator.config.saved import SaveError
 from coordinator.runtime.machine import Machine
 from nodes.clock.clock import Ticks, extend32
 from nodes.node.node import Node
+from nodes.support.awake import call_between
 
 AHEAD_S: Final = 0.1
 """How far ahead of now the earliest commands are timed: they need their time to the node."""
+
+SLACK: Final = 0.1
+"""By how much of its period something that is done again and again may be later."""
 
 
 class ModuleContext:
@@ -60,8 +64,8 @@ class ModuleContext:
     def every(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
         """Call CALL every so many seconds; returns what ends it. All end when the machine closes.
 
-        Calls of one period come together, so that they wake the computer once: the first comes after half to
-        one and a half periods.
+        Calls of one period come together, so that they wake the computer once, and up to a tenth of it later,
+        when it is awake anyway: the first comes after half to one and a half periods.
         """
         timer = _Timer(seconds, call, again=True, ended=self._timers.discard)
         self._timers.add(timer)
@@ -112,17 +116,22 @@ class _Timer:
         self._due_s = self._loop.time() + seconds
         if again:
             self._due_s = round(self._due_s / seconds) * seconds
-        self._handle = self._loop.call_at(self._due_s, self._fire)
+        self._cancel = self._wait()
+
+    def _wait(self) -> Callable[[], None]:
+        if self._again:
+            return call_between(self._due_s, self._due_s + SLACK * self._seconds, self._fire)
+        return self._loop.call_at(self._due_s, self._fire).cancel
 
     def _fire(self) -> None:
         if self._again:
             # Missed calls are not repeated: the loop was busy, or the machine slept.
             self._due_s = max(self._due_s + self._seconds, self._loop.time())
-            self._handle = self._loop.call_at(self._due_s, self._fire)
+            self._cancel = self._wait()
         else:
             self._ended(self)
         self._call()
 
     def end(self) -> None:
-        self._handle.cancel()
+        self._cancel()
         self._ended(self)
