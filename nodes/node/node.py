@@ -205,9 +205,8 @@ class Node:
 
     def let_measurements_wait(self, *, wait: bool) -> None:
         """Let what sensors measure WAIT from now on, or not, as when the node has started."""
-        if self.talks:
-            with contextlib.suppress(CanductorError):  # the link is lost
-                self._talk.let_wait(MEASURED, MEASURED_PATIENCE_S if wait else 0.0)
+        with contextlib.suppress(CanductorError):  # there is no link, or it is lost
+            self._talk.let_wait(MEASURED, MEASURED_PATIENCE_S if wait else 0.0)
 
     def explain_shutdown(self, explain: ExplainShutdown) -> None:
         """Have EXPLAIN add to the sentence of a shutdown, until the node is started again."""

@@ -52,6 +52,11 @@ def test_what_has_time_is_done_once_when_the_loop_is_awake() -> None:
         for _ in range(3):
             await asyncio.sleep(0.001)
         assert done == ["it may"]
+        now_s = loop.time()
+        call_between(now_s, now_s + 0.02, lambda: done.append("only once"))
+        await asyncio.sleep(0.001)
+        await asyncio.sleep(0.04)
+        assert done == ["it may", "only once"]
 
     run(test)
 

@@ -7,6 +7,7 @@ import struct
 import time
 import tty
 from collections.abc import Callable, Coroutine
+from typing import Any
 
 import pytest
 
@@ -352,6 +353,12 @@ class Waking(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
         super().__init__()
         self.looks: list[Callable[[], None]] = []
+        self.soon = 0
+        """How often something was to be called soon."""
+
+    def call_soon(self, *args: Any, **options: Any) -> asyncio.Handle:  # type: ignore[override]
+        self.soon += 1
+        return super().call_soon(*args, **options)
 
     def when_awake(self, call: Callable[[], None]) -> Callable[[], None]:
         self.looks.append(call)
@@ -371,6 +378,9 @@ def test_what_may_wait_is_taken_when_the_loop_is_awake_or_asked_for(kind: Transp
         with bench(kind, {node_id(kind): NodeTwin()}) as b:
             link = b.open(node_id(kind))
             (look,) = loop.looks
+            soon = loop.soon
+            look()
+            assert loop.soon == soon, "nothing waits"
             link.let_wait(answer(1)[:1], 3600.0)
             for count in (1, 2):
                 link.send(ask(count))
