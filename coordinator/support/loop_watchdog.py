@@ -90,7 +90,7 @@ class _WatchedSelector(selectors.DefaultSelector):
         self.busy_since_s = 0.0
         """When the loop began to work; 0: it rests."""
         self.when_awake: list[Callable[[], None]] = []
-        """What is called after each rest."""
+        """What is called after a rest that a timer has ended."""
 
     def close(self) -> None:
         super().close()
@@ -103,7 +103,7 @@ class _WatchedSelector(selectors.DefaultSelector):
         events = super().select(timeout)
         self.busy_since_s = time.monotonic()
         self.timer.arm()
-        if timeout != 0:
+        if timeout != 0 and not events:  # else somebody waits for what the loop does next
             for call in tuple(self.when_awake):
                 call()
         return events
@@ -133,7 +133,9 @@ class WatchedLoop(asyncio.SelectorEventLoop):
         self.when_awake(self._call_what_has_time)
 
     def when_awake(self, call: Callable[[], None]) -> Callable[[], None]:
-        """Call CALL whenever the loop has woken up, before all else; return what ends that.
+        """Call CALL whenever a timer has woken the loop, before all else; return what ends that.
+
+        Who has sent something to the program does not wait for what has time.
 
         It must be quick and not raise; what it has to do is for ``call_soon``.
         """

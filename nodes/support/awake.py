@@ -11,7 +11,7 @@ class WakingLoop(Protocol):
     """An event loop that says when it is awake."""
 
     def when_awake(self, call: Callable[[], None], /) -> Callable[[], None]:
-        """Call CALL whenever the loop has woken up; return what ends that."""
+        """Call CALL whenever the loop has woken up and nobody waits for it; return what ends that."""
 
     def call_between(
         self, earliest_s: float, latest_s: float, call: Callable[[], None], /

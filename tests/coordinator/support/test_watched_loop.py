@@ -1,6 +1,7 @@
 """The control loop says when it is awake, and what has time is done then."""
 
 import asyncio
+import os
 from collections.abc import Callable, Coroutine
 
 import pytest
@@ -39,6 +40,25 @@ def test_who_asked_is_called_when_the_loop_wakes() -> None:
         done.clear()
         await asyncio.sleep(0.001)
         assert done == []
+
+    run(test)
+
+
+def test_who_has_sent_something_does_not_wait_for_what_has_time() -> None:
+    async def test(loop: WatchedLoop) -> None:
+        done: list[str] = []
+        came = asyncio.Event()
+        reads, writes = os.pipe()
+        loop.add_reader(reads, came.set)
+        call_between(loop.time(), loop.time() + NEVER_S, lambda: done.append("it may"))
+        os.write(writes, b"?")
+        await came.wait()
+        loop.remove_reader(reads)
+        os.close(reads)
+        os.close(writes)
+        assert done == []
+        await asyncio.sleep(0.001)
+        assert done == ["it may"]
 
     run(test)
 
