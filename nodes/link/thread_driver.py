@@ -34,7 +34,7 @@ class ThreadDriver:
     def listen(self, handler: Callable[[], None]) -> None:
         """Call HANDLER in the loop's thread when io_take() has something.
 
-        What may wait is taken when the loop is awake anyway, if it says so.
+        What may wait is also taken when a timer has woken the loop, if the loop says so.
         """
         self._loop.add_reader(self._notice_fd, handler)
 

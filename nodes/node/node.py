@@ -36,7 +36,7 @@ ALIVE_TIMEOUT_S: Final = 0.1
 """Time for a node to prove that it is alive when another board claims its identity."""
 CLOCK_TIMEOUT_S: Final = 15.0
 """On a bus that loses one frame in twenty, every fourth sample is lost or unusable."""
-PATIENCE_S: Final = {"clock": 0.1, "sync_pulse": 0.1, "config": 1.0, "uptime": 1.0, "stats": 1.0}
+PATIENCE_S: Final = {"clock": 0.1, "sync_pulse": 0.1, "config": 0.1, "uptime": 0.1, "stats": 1.0}
 """How long responses that come all the time may wait until something else wakes the host."""
 MEASURED: Final = "analog_in_state"
 MEASURED_PATIENCE_S: Final = 1.0

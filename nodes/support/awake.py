@@ -1,4 +1,4 @@
-"""What has time until an event loop is awake anyway: a computer that rests is woken once for all of it."""
+"""Timers with slack: what has time until an event loop is awake anyway, which is woken once for all then."""
 
 import asyncio
 import functools

@@ -197,7 +197,7 @@ class TwinLink:
         self.waiting: deque[Response] = deque()
         """What has arrived and is handed over when it is asked for."""
         self.failure: LinkError | None = None
-        """What it raises when it is told of patience or hurry."""
+        """Raised by ``let_wait`` and ``hurry``."""
 
     def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False) -> None:
         assert not self.closed

@@ -186,7 +186,7 @@ static void the_line_is_read_until_it_is_empty(void) {
     stop(thread);
 }
 
-// The notice comes after the lock is free: who took the events by another occasion is told once more.
+// The notice is given after the lock is free, so it may come when the events were taken already.
 static void a_late_notice_of_nothing_ends(void) {
     struct io_thread *thread = start(IO_CAN_STREAM, &unknown_speed);
     reading_gives(FRAME, 0, &a_frame);

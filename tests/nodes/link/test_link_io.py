@@ -385,7 +385,7 @@ def test_what_may_wait_is_taken_when_the_loop_is_awake_or_asked_for(kind: Transp
             for count in (1, 2):
                 link.send(ask(count))
                 async with asyncio.timeout(TIMEOUT_S):
-                    while not b.io._lib.io_waits(b.io._bus.live()):  # noqa: ASYNC110  nothing tells of it
+                    while not b.io._lib.io_waits(b.io._bus.live()):  # noqa: ASYNC110  there is no event for it
                         await asyncio.sleep(0.001)
                 assert len(b.inbox.responses) == count - 1
                 if count == 1:
