@@ -47,10 +47,9 @@ def copied(trapezoids: Any, count: int) -> bytes:
     return bytes(ffi.buffer(trapezoids, count * MOVE_BYTES))
 
 
-def begin_s(moves: bytes, index: int) -> float:
-    """Return the print time at which the move INDEX of MOVES begins."""
-    at: float = _BEGIN.unpack_from(moves, index * MOVE_BYTES)[0]
-    return at
+def begin_times_s(moves: bytes) -> "memoryview[float]":
+    """Return the print time at which each of MOVES begins."""
+    return memoryview(moves).cast("d")[:: MOVE_BYTES // _DOUBLE_BYTES]
 
 
 def end_s(moves: bytes, index: int) -> float:

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any, Final
 
+from nodes.support.awake import WakingLoop
 from nodes.support.terminal import show_error
 
 LOOK_S: Final = 0.01
@@ -121,7 +122,7 @@ class _Flexible:
         """Wakes the loop at the latest time; then of the call itself."""
 
 
-class WatchedLoop(asyncio.SelectorEventLoop):
+class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
     """asyncio's loop, which a LoopWatchdog can watch."""
 
     _ssock: socket.socket

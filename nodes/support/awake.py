@@ -2,19 +2,20 @@
 
 import asyncio
 import functools
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 
-@runtime_checkable
-class WakingLoop(Protocol):
+class WakingLoop(ABC):
     """An event loop that says when it is awake."""
 
-    def when_awake(self, call: Callable[[], None], /) -> Callable[[], None]:
+    @abstractmethod
+    def when_awake(self, call: Callable[[], None]) -> Callable[[], None]:
         """Call CALL whenever the loop has woken up and nobody waits for it; return what ends that."""
 
+    @abstractmethod
     def call_between(
-        self, earliest_s: float, latest_s: float, call: Callable[[], None], /
+        self, earliest_s: float, latest_s: float, call: Callable[[], None]
     ) -> Callable[[], None]:
         """Call CALL once, when the loop is awake anyway between two of its times, else at the later one.
 

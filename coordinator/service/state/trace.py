@@ -15,7 +15,7 @@ from coordinator.motion.moves import (
     MOVE_BYTES,
     Move,
     begin_heights_mm,
-    begin_s,
+    begin_times_s,
     copied,
     end_s,
     read_move,
@@ -110,8 +110,7 @@ class MotionTrace:
     def at(self, print_time: float) -> Moment | None:
         """Return where the machine is at PRINT_TIME; None before all that is known."""
         for piece in reversed(self._pieces):
-            count = len(piece) // MOVE_BYTES
-            index = bisect_right(range(count), print_time, key=lambda i: begin_s(piece, i)) - 1
+            index = bisect_right(begin_times_s(piece), print_time) - 1
             if index >= 0:
                 return _moment(read_move(piece, index), print_time)
         return None
@@ -129,8 +128,8 @@ class MotionTrace:
         """Yield the moves that end after print time SINCE_S, in pieces with at least one, oldest first."""
         for piece in self._pieces:
             if end_s(piece, -1) > since_s:
-                count = len(piece) // MOVE_BYTES
-                first = bisect_right(range(count), since_s, key=lambda i: end_s(piece, i))
+                begun = bisect_right(begin_times_s(piece), since_s)
+                first = begun - 1 if begun and end_s(piece, begun - 1) > since_s else begun
                 yield piece[first * MOVE_BYTES :]
 
     @property

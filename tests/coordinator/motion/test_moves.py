@@ -7,7 +7,7 @@ from coordinator.motion.moves import (
     MOVE_BYTES,
     Move,
     begin_heights_mm,
-    begin_s,
+    begin_times_s,
     end_s,
     read_move,
     read_moves,
@@ -40,7 +40,7 @@ def test_every_field_is_where_the_compiler_has_it() -> None:
 def test_times_and_heights() -> None:
     moves = some_moves(4)
     data, last = moves.tobytes(), moves[-1]
-    assert begin_s(data, 1) == moves[1]["print_time"]
+    assert begin_times_s(data).tolist() == moves["print_time"].tolist()
     phases = ("print_time", "accel_s", "cruise_s", "decel_s")
     assert end_s(data, -1) == pytest.approx(sum(last[name] for name in phases))
     assert begin_heights_mm(data).tolist() == moves["start"][:, 2].tolist()

@@ -110,9 +110,18 @@ def test_commands_of_long_ago_are_forgotten() -> None:
 
 def test_only_the_stretch_that_is_asked_for() -> None:
     planner, trace = planned(LINES)
-    assert len(trace.moves(0.0)) == 5
-    assert len(trace.moves(planner.print_time_end_s + 1e-6)) == 0
-    assert [move.line for move in trace.moves(planner.print_time_end_s - 1e-3)] == [5]
+    planner.begin_at(planner.print_time_end_s + 3.0)  # it stands meanwhile
+    planner.feed(LINES, 0, len(LINES), final=True)
+    assert planner.flush()
+    trace.see_moves(planner.take().pointer, planner.take().count)
+    everything = trace.moves(0.0)
+    assert len(everything) == 10
+    begins = [move.print_time for move in everything]
+    ends = [sum(move[:4]) for move in everything]
+    borders = np.array(begins + ends)
+    times = [*np.linspace(99.0, ends[-1] + 1.0, 500), *(borders - 1e-6), *(borders + 1e-6), ends[4]]
+    for since_s in times:
+        assert trace.moves(since_s) == [m for m, end in zip(everything, ends, strict=True) if end > since_s]
 
 
 def test_fresh_moves_are_taken_once() -> None:
