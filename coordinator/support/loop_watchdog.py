@@ -22,9 +22,9 @@ from typing import Any, Final
 from nodes.support.awake import WakingLoop
 from nodes.support.terminal import show_error
 
-LOOK_S: Final = 0.01
-"""From so long on, a loop that is still at work is looked at."""
-AGAIN_S: Final = 0.002
+LOOK_S: Final = 0.005
+"""From so long on, a loop that is still at work is looked at: half of what a stop may take while it is quick."""
+AGAIN_S: Final = 0.001
 """Between further looks; a TLS handshake takes three of them."""
 HELD_S: Final = 0.05
 """Nothing may hold the loop for so long; it is reported."""
