@@ -15,6 +15,9 @@ and program; its Python is --peer-python. The peer is not a part of this project
 figures of PEER_FIGURES are printed. Three nodes are measured with ours only: the peer cannot reach a virtual
 CAN bus.
 
+The first line says how fast the computer is: a host that is woken some ten times a second does little, but
+finds nothing of what it needs in the caches.
+
 Usage: python bench/realtime.py [--seconds S] [--only STATE ...] [--peer PATH [--peer-python PATH]]
 """
 
@@ -22,6 +25,7 @@ import argparse
 import contextlib
 import json
 import os
+import random
 import signal
 import socket
 import statistics
@@ -48,6 +52,7 @@ SETTLE_S = 6.0
 FILAMENT_MM = 5.0
 """Once the print has taken so much it is not homing any more."""
 SCRIPTS = 40
+"""Also how often memory is timed."""
 START_S = 60.0
 STATES = ("waiting", "heating", "script", "printing", "watched")
 PRINTS = 3
@@ -58,6 +63,10 @@ WATCHED_S = 0.25
 """Between two queries of all clients together."""
 PEER_FIGURES = "waiting 0.3 %, printing 0.8 % of a core, 34 MB resident"
 """One node, the same file; measured on another computer beside e013306, which took 2 %, 2.7 %, 59 MB."""
+LOOP_ROUNDS = 10_000_000
+SCATTERED = 4096
+"""Numbers that are added, each in a line of the caches of its own."""
+REST_S = 0.02
 CARD = "\n[virtual_sdcard]\npath: {folder}\n[pause_resume]\n"
 
 
@@ -88,6 +97,37 @@ class Sample:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         ticks = int(fields[11]) + int(fields[12])
         return cls(time.monotonic(), cpu_s, ticks / os.sysconf("SC_CLK_TCK"), wakeups)
+
+
+def loop_s() -> float:
+    """Return the processor time of LOOP_ROUNDS of Python's plainest loop."""
+    before_s = time.thread_time()
+    for _ in range(LOOP_ROUNDS):
+        pass
+    return time.thread_time() - before_s
+
+
+def scattered_ns(rest_s: float) -> float:
+    """Return the processor time in which a number is added that lies anywhere, after a rest of REST_S."""
+    apart = [0.5 + number for number in range(4 * SCATTERED)][::4]
+    random.Random(1).shuffle(apart)
+    taken_ns = []
+    for _ in range(SCRIPTS):
+        time.sleep(rest_s)
+        before_ns = time.thread_time_ns()
+        sum(apart)
+        taken_ns.append(time.thread_time_ns() - before_ns)
+    return statistics.median(taken_ns) / SCATTERED
+
+
+def print_computer() -> None:
+    """Print how fast this computer is."""
+    print(
+        f"this computer: {LOOP_ROUNDS / 1e6:.0f} million rounds of a Python loop take {loop_s():.2f} s;"
+        f" a number from memory {scattered_ns(0):.0f} ns, {scattered_ns(REST_S):.0f} ns after a rest of"
+        f" {REST_S * 1e3:.0f} ms",
+        flush=True,
+    )
 
 
 def memory_mb(pid: int) -> tuple[float, float]:
@@ -380,6 +420,7 @@ def main() -> None:
     )
     chosen = parser.parse_args()
     os.chdir(ROOT)
+    print_computer()
     if 1 in chosen.nodes:
         play(ONE_NODE, "canductor, one node on a UART:", ours, chosen)
     if 3 in chosen.nodes:
