@@ -346,11 +346,14 @@ class Machine:
                     functools.partial(_taken, opened.bus),
                 )
 
-    def let_measurements_wait(self) -> None:
-        """Let what sensors measure wait as long as nothing acts on it; call it again and again."""
+    def let_reports_wait(self, *, rests: bool) -> None:
+        """Let what nodes report wait where nothing depends on it; call it again and again.
+
+        What sensors measure while nothing acts on it, and their state while the machine RESTS, too.
+        """
         wait = not self.modules.controls
         for node in self.nodes.values():
-            node.let_measurements_wait(wait=wait)
+            node.let_reports_wait(measurements=wait, state=wait and rests)
 
     def is_busy(self, load: float) -> bool:
         """Return whether a bus has carried more than LOAD lately, a share of its time."""

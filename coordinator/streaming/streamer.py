@@ -216,7 +216,7 @@ class Streamer:
         """Wait PAUSE_S, or until ``call``."""
         if self._called:
             return
-        self._machine.let_measurements_wait()
+        self._machine.let_reports_wait(rests=pause_s == REST_CYCLE_S and self._standstill is None)
         loop = asyncio.get_running_loop()
         self._pause = loop.create_future()
         ends_s = loop.time() + pause_s

@@ -23,7 +23,7 @@ from nodes.support.awake import WakingLoop
 from nodes.support.terminal import show_error
 
 LOOK_S: Final = 0.005
-"""From so long on, a loop that is still at work is looked at: half of what a stop may take while it is quick."""
+"""From so long on, a loop that is still at work is looked at: half of what a stop may take if it is quick."""
 AGAIN_S: Final = 0.001
 """Between further looks; a TLS handshake takes three of them."""
 HELD_S: Final = 0.05

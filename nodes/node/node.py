@@ -39,8 +39,9 @@ CLOCK_TIMEOUT_S: Final = 15.0
 PATIENCE_S: Final = {"clock": 0.1, "sync_pulse": 0.1, "config": 0.1, "uptime": 0.1, "stats": 1.0}
 """How long responses that come all the time may wait until something else wakes the host."""
 MEASURED: Final = "analog_in_state"
-MEASURED_PATIENCE_S: Final = 1.0
-"""The same of what sensors measure while nothing acts on it."""
+STATE: Final = ("config", "uptime")
+REST_PATIENCE_S: Final = 1.0
+"""The same of what sensors measure while nothing acts on it, and of a node's state while all is at rest."""
 
 ClockSource = Literal["pulse", "exchange"]
 OnState = Callable[["Node"], None]
@@ -203,10 +204,12 @@ class Node:
         """Call CALLBACK for every RESPONSE (of OID, unless None); return a function that ends it."""
         return self._talk.on(response, oid, callback)
 
-    def let_measurements_wait(self, *, wait: bool) -> None:
-        """Let what sensors measure WAIT from now on, or not, as when the node has started."""
+    def let_reports_wait(self, *, measurements: bool, state: bool) -> None:
+        """Let what sensors measure and what the node says of its STATE wait for long from now on, or not."""
         with contextlib.suppress(CanductorError):  # there is no link, or it is lost
-            self._talk.let_wait(MEASURED, MEASURED_PATIENCE_S if wait else 0.0)
+            self._talk.let_wait(MEASURED, REST_PATIENCE_S if measurements else 0.0)
+            for response in STATE:
+                self._talk.let_wait(response, REST_PATIENCE_S if state else PATIENCE_S[response])
 
     def explain_shutdown(self, explain: ExplainShutdown) -> None:
         """Have EXPLAIN add to the sentence of a shutdown, until the node is started again."""

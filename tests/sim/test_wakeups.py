@@ -9,7 +9,7 @@ from coordinator.simulate.stage import Stage
 from coordinator.streaming.streamer import FULL_CYCLE_S, REST_CYCLE_S
 from coordinator.streaming.worker import SEND_AHEAD_S
 from nodes.devices.analog_in import REPORT_S
-from nodes.node.node import MEASURED_PATIENCE_S
+from nodes.node.node import PATIENCE_S, REST_PATIENCE_S
 from tests.stages.printer import Printer, gcode
 from tests.stages.served import Served, running, zigzag
 
@@ -19,6 +19,8 @@ SCRIPT_S = 0.005
 """In virtual time, which does not pass while anything is computed: a wait for the next cycle would show."""
 SOON_S = 0.03
 """A measurement takes some 10 ms, and its way."""
+QUESTIONS = 8
+"""Other things wake the coordinator, too: not each of them waits as long as it may."""
 SETTLE_S = 1.5
 """Until the tree is not read any more."""
 
@@ -91,16 +93,47 @@ def test_measurements_wait_only_while_nothing_acts_on_them(tmp_path: Path) -> No
         bed.unit.input.on_measured = measured
 
         async def oldest_s() -> float:
-            await asyncio.sleep(REST_CYCLE_S + MEASURED_PATIENCE_S)  # until it is known whether it is on
+            await asyncio.sleep(REST_CYCLE_S + REST_PATIENCE_S)  # until it is known whether it is on
             ages_s.clear()
             await asyncio.sleep(5.0)
             assert len(ages_s) > 5.0 / REPORT_S - 5, "none is lost"
             return max(ages_s)
 
         for _ in range(2):
-            assert MEASURED_PATIENCE_S / 2 < await oldest_s() < MEASURED_PATIENCE_S + SOON_S
+            assert REST_PATIENCE_S / 2 < await oldest_s() < REST_PATIENCE_S + SOON_S
             await gcode(stage, "M140 S60")
             assert await oldest_s() < SOON_S
             await gcode(stage, "M140 S0")
+
+    printer.serve(go)
+
+
+def test_the_state_of_a_node_waits_only_while_nothing_can_happen(tmp_path: Path) -> None:
+    printer = Printer(tmp_path)
+
+    async def go(stage: Served) -> None:
+        machine, loop = stage.service.machine, asyncio.get_running_loop()
+        assert machine is not None
+
+        async def longest_s() -> float:
+            await asyncio.sleep(REST_CYCLE_S + REST_PATIENCE_S)
+            took_s = []
+            for _ in range(QUESTIONS):
+                asked_s = loop.time()
+                await machine.primary.query("get_config", "config", patient=True)
+                took_s.append(loop.time() - asked_s)
+                await asyncio.sleep(0.1)
+            return max(took_s)
+
+        at_once_s = PATIENCE_S["config"] + SOON_S
+        assert at_once_s < await longest_s() < REST_PATIENCE_S + SOON_S
+        await gcode(stage, "M140 S60")
+        assert await longest_s() < at_once_s
+        await gcode(stage, "M140 S0")
+        assert await longest_s() > at_once_s
+        moving = asyncio.ensure_future(gcode(stage, "G28", *["G1 X200 F3000", "G1 X10"] * 10))
+        assert await longest_s() < at_once_s
+        assert not moving.done()
+        await moving
 
     printer.serve(go)

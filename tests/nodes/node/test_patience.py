@@ -6,7 +6,7 @@ import pytest
 
 from nodes.link import LinkError, Response
 from nodes.node.errors import NodeLost
-from nodes.node.node import MEASURED, MEASURED_PATIENCE_S, PATIENCE_S
+from nodes.node.node import MEASURED, PATIENCE_S, REST_PATIENCE_S, STATE
 from nodes.node.request_reply import QUERY_TIMEOUT_S, QueryTimeout
 from nodes.node.states import NodeState
 from tests.nodes import virtual_time
@@ -162,16 +162,19 @@ def test_a_node_that_is_ready_lets_what_comes_all_the_time_wait() -> None:
         for name, seconds in PATIENCE_S.items():
             assert patience_s(name) == seconds if name in responses else name == "sync_pulse"
         assert patience_s(MEASURED) is None
-        machine.node.let_measurements_wait(wait=True)
-        assert patience_s(MEASURED) == MEASURED_PATIENCE_S
-        machine.node.let_measurements_wait(wait=False)
+        for state in (True, False):
+            machine.node.let_reports_wait(measurements=True, state=state)
+            assert patience_s(MEASURED) == REST_PATIENCE_S
+            for name in STATE:
+                assert patience_s(name) == (REST_PATIENCE_S if state else PATIENCE_S[name])
+        machine.node.let_reports_wait(measurements=False, state=False)
         assert patience_s(MEASURED) == 0
-        machine.node.let_measurements_wait(wait=True)
+        machine.node.let_reports_wait(measurements=True, state=True)
         machine.io.links[-1].failure = LinkError("can0 node 4: lost")
-        machine.node.let_measurements_wait(wait=False)  # a link that is lost is reported elsewhere
+        machine.node.let_reports_wait(measurements=False, state=False)  # a lost link is reported elsewhere
         machine.io.links[-1].failure = None
         await machine.node.restart()
         assert patience_s(MEASURED) is None
 
     machine.run(machine.bus.start, check)
-    machine.node.let_measurements_wait(wait=True)  # without effect on one that is closed
+    machine.node.let_reports_wait(measurements=True, state=True)  # without effect on one that is closed
