@@ -36,10 +36,16 @@ ALIVE_TIMEOUT_S: Final = 0.1
 """Time for a node to prove that it is alive when another board claims its identity."""
 CLOCK_TIMEOUT_S: Final = 15.0
 """On a bus that loses one frame in twenty, every fourth sample is lost or unusable."""
-PATIENCE_S: Final = {"clock": 0.1, "sync_pulse": 0.1, "config": 0.1, "uptime": 0.1, "stats": 1.0}
-"""How long responses that come all the time may wait until something else wakes the host."""
 MEASURED: Final = "analog_in_state"
 STATE: Final = ("config", "uptime")
+PATIENCE_S: Final = {
+    "clock": 0.1,
+    "sync_pulse": 0.1,
+    **dict.fromkeys(STATE, 0.1),
+    "stats": 1.0,
+    MEASURED: 0.005,  # the sensors of a node report together; a heater is controlled by what they say
+}
+"""How long responses that come all the time may wait until something else wakes the host."""
 REST_PATIENCE_S: Final = 1.0
 """The same of what sensors measure while nothing acts on it, and of a node's state while all is at rest."""
 
@@ -207,9 +213,8 @@ class Node:
     def let_reports_wait(self, *, measurements: bool, state: bool) -> None:
         """Let what sensors measure and what the node says of its STATE wait for long from now on, or not."""
         with contextlib.suppress(CanductorError):  # there is no link, or it is lost
-            self._talk.let_wait(MEASURED, REST_PATIENCE_S if measurements else 0.0)
-            for response in STATE:
-                self._talk.let_wait(response, REST_PATIENCE_S if state else PATIENCE_S[response])
+            for response, rests in {MEASURED: measurements, **dict.fromkeys(STATE, state)}.items():
+                self._talk.let_wait(response, REST_PATIENCE_S if rests else PATIENCE_S[response])
 
     def explain_shutdown(self, explain: ExplainShutdown) -> None:
         """Have EXPLAIN add to the sentence of a shutdown, until the node is started again."""

@@ -10,7 +10,7 @@ from coordinator.streaming.streamer import FULL_CYCLE_S, REST_CYCLE_S
 from coordinator.streaming.worker import SEND_AHEAD_S
 from nodes.devices.analog_in import REPORT_S
 from nodes.node.node import PATIENCE_S, REST_PATIENCE_S
-from tests.stages.printer import Printer, gcode
+from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served, running, zigzag
 
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
@@ -19,6 +19,11 @@ SCRIPT_S = 0.005
 """In virtual time, which does not pass while anything is computed: a wait for the next cycle would show."""
 SOON_S = 0.03
 """A measurement takes some 10 ms, and its way."""
+SECOND_SENSOR = """
+[temperature_sensor frame]
+sensor_type: Generic 3950
+sensor_pin: PB7
+"""
 QUESTIONS = 8
 """Other things wake the coordinator, too: not each of them waits as long as it may."""
 SETTLE_S = 1.5
@@ -104,6 +109,24 @@ def test_measurements_wait_only_while_nothing_acts_on_them(tmp_path: Path) -> No
             await gcode(stage, "M140 S60")
             assert await oldest_s() < SOON_S
             await gcode(stage, "M140 S0")
+
+    printer.serve(go)
+
+
+def test_the_sensors_of_a_node_wake_the_coordinator_together(tmp_path: Path) -> None:
+    printer = Printer(tmp_path, PRINTING + SECOND_SENSOR)
+
+    async def go(stage: Served) -> None:
+        machine, loop = stage.service.machine, asyncio.get_running_loop()
+        assert machine is not None
+        await gcode(stage, "M140 S60")
+        await asyncio.sleep(REST_CYCLE_S + REST_PATIENCE_S)
+        times_s: list[float] = []
+        end = machine.primary.on("analog_in_state", None, lambda _: times_s.append(loop.time()))
+        await asyncio.sleep(5.0)
+        end()
+        assert len(times_s) >= 2 * (5.0 / REPORT_S - 1)
+        assert len(set(times_s)) <= len(times_s) / 2 + 1
 
     printer.serve(go)
 
