@@ -90,8 +90,8 @@ class _WatchedSelector(selectors.DefaultSelector):
         self.timer = _Timer(LOOK_S, AGAIN_S)
         self.busy_since_s = 0.0
         """When the loop began to work; 0: it rests."""
-        self.when_awake: list[Callable[[], None]] = []
-        """What is called after a rest that a timer has ended."""
+        self.rested = False
+        """Whether it might have rested before that."""
 
     def close(self) -> None:
         super().close()
@@ -104,9 +104,7 @@ class _WatchedSelector(selectors.DefaultSelector):
         events = super().select(timeout)
         self.busy_since_s = time.monotonic()
         self.timer.arm()
-        if timeout != 0 and not events:  # else somebody waits for what the loop does next
-            for call in tuple(self.when_awake):
-                call()
+        self.rested = timeout != 0
         return events
 
 
@@ -130,22 +128,35 @@ class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
     def __init__(self) -> None:
         self.watched = _WatchedSelector()
         self._flexible: list[_Flexible] = []
+        self._when_awake: list[Callable[[], None]] = []
+        self._unhurried: set[int] = set()
+        """Descriptors whose events let others go on who have time."""
         super().__init__(self.watched)
         self.when_awake(self._call_what_has_time)
 
-    def when_awake(self, call: Callable[[], None]) -> Callable[[], None]:
-        """Call CALL whenever a timer has woken the loop, before all else; return what ends that.
+    def when_awake(self, call: Callable[[], None], *, also_by: int | None = None) -> Callable[[], None]:
+        """Call CALL whenever a timer or the descriptor ALSO_BY has woken the loop; return what ends that.
 
         Who has sent something to the program does not wait for what has time.
 
-        It must be quick and not raise; what it has to do is for ``call_soon``.
+        It must be quick and not raise; what it has to do is for ``call_soon``, behind what has come.
         """
-        self.watched.when_awake.append(call)
+        self._when_awake.append(call)
+        if also_by is not None:
+            self._unhurried.add(also_by)
 
         def end() -> None:
-            self.watched.when_awake.remove(call)
+            self._when_awake.remove(call)
+            if also_by is not None:
+                self._unhurried.remove(also_by)
 
         return end
+
+    def _process_events(self, event_list: list[tuple[selectors.SelectorKey, int]]) -> None:
+        super()._process_events(event_list)  # type: ignore[misc]
+        if self.watched.rested and all(key.fd in self._unhurried for key, _ in event_list):
+            for call in tuple(self._when_awake):
+                call()
 
     def call_between(
         self, earliest_s: float, latest_s: float, call: Callable[[], None]

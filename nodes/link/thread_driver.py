@@ -34,7 +34,7 @@ class ThreadDriver:
     def listen(self, handler: Callable[[], None]) -> None:
         """Call HANDLER in the loop's thread when io_take() has something.
 
-        What may wait is also taken when a timer has woken the loop, if the loop says so.
+        What may wait is also taken when a timer or another bus has woken the loop, if the loop says so.
         """
         self._loop.add_reader(self._notice_fd, handler)
 
@@ -43,7 +43,7 @@ class ThreadDriver:
                 self._loop.call_soon(handler)
 
         if isinstance(self._loop, WakingLoop):
-            self._look_no_more = self._loop.when_awake(look)
+            self._look_no_more = self._loop.when_awake(look, also_by=self._notice_fd)
 
     def close(self) -> None:
         """Join the thread and free the bus."""

@@ -10,8 +10,11 @@ class WakingLoop(ABC):
     """An event loop that says when it is awake."""
 
     @abstractmethod
-    def when_awake(self, call: Callable[[], None]) -> Callable[[], None]:
-        """Call CALL whenever the loop has woken up and nobody waits for it; return what ends that."""
+    def when_awake(self, call: Callable[[], None], *, also_by: int | None = None) -> Callable[[], None]:
+        """Call CALL whenever the loop has woken up and nobody waits for it; return what ends that.
+
+        Nobody waits for what comes from the descriptor ALSO_BY, or is there for whom others need not wait.
+        """
 
     @abstractmethod
     def call_between(

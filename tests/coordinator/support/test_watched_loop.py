@@ -63,6 +63,45 @@ def test_who_has_sent_something_does_not_wait_for_what_has_time() -> None:
     run(test)
 
 
+def test_what_nobody_waits_for_takes_along_what_has_time() -> None:
+    async def test(loop: WatchedLoop) -> None:
+        done: list[str] = []
+        pipes = [os.pipe() for _ in range(2)]
+        came = [asyncio.Event() for _ in pipes]
+
+        def read(number: int) -> None:
+            os.read(pipes[number][0], 1)
+            done.append(f"pipe {number}")
+            came[number].set()
+
+        async def write(*numbers: int) -> None:
+            for number in numbers:
+                os.write(pipes[number][1], b"?")
+            for number in numbers:
+                await came[number].wait()
+                came[number].clear()
+            await asyncio.sleep(0)
+
+        for number, (reads, _) in enumerate(pipes):
+            loop.add_reader(reads, read, number)
+        end = loop.when_awake(lambda: None, also_by=pipes[0][0])
+        call_between(loop.time(), loop.time() + NEVER_S, lambda: done.append("it may"))
+        await write(0, 1)
+        assert sorted(done) == ["pipe 0", "pipe 1"], "somebody else waits"
+        await write(0)
+        assert done[2:] == ["pipe 0", "it may"], "after what has come"
+        end()
+        call_between(loop.time(), loop.time() + NEVER_S, lambda: done.append("it may not"))
+        await write(0)
+        assert done[4:] == ["pipe 0"]
+        for reads, writes in pipes:
+            loop.remove_reader(reads)
+            os.close(reads)
+            os.close(writes)
+
+    run(test)
+
+
 def test_what_has_time_is_done_once_when_the_loop_is_awake() -> None:
     async def test(loop: WatchedLoop) -> None:
         done: list[str] = []
@@ -102,7 +141,7 @@ def test_the_later_time_needs_no_other_occasion() -> None:
 
     async def test(loop: WatchedLoop) -> None:
         came = asyncio.Event()
-        loop.watched.when_awake.clear()
+        loop._when_awake.clear()
         call_between(loop.time(), loop.time() + 0.001, came.set)
         async with asyncio.timeout(NEVER_S):
             await came.wait()

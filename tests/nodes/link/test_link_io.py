@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from nodes.link import LinkError, LinkIO, LinkSettings, TransportKind
+from nodes.support.awake import WakingLoop
 from tests.nodes.link.peers import TIMEOUT_S, Bench, FdTransport, Inbox, bench, open_files, pack_frame
 from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, store
 
@@ -347,12 +348,13 @@ def test_full_queues_and_bad_arguments_are_refused_in_words() -> None:
     run(test())
 
 
-class Waking(asyncio.SelectorEventLoop):
+class Waking(asyncio.SelectorEventLoop, WakingLoop):
     """A loop that says when it is awake, when the test says so."""
 
     def __init__(self) -> None:
         super().__init__()
         self.looks: list[Callable[[], None]] = []
+        self.also_by: int | None = None
         self.soon = 0
         """How often something was to be called soon."""
 
@@ -360,7 +362,8 @@ class Waking(asyncio.SelectorEventLoop):
         self.soon += 1
         return super().call_soon(*args, **options)
 
-    def when_awake(self, call: Callable[[], None]) -> Callable[[], None]:
+    def when_awake(self, call: Callable[[], None], *, also_by: int | None = None) -> Callable[[], None]:
+        self.also_by = also_by
         self.looks.append(call)
         return lambda: self.looks.remove(call)
 
@@ -399,6 +402,8 @@ def test_what_may_wait_is_taken_when_the_loop_is_awake_or_asked_for(kind: Transp
             await b.inbox.until(lambda: len(b.inbox.responses) == 3)
             with pytest.raises(LinkError, match="no room to let responses with the id  wait"):
                 link.let_wait(b"", 1.0)
+            assert loop.also_by is not None
+            assert loop.remove_reader(loop.also_by), "what wakes the others is what wakes the link"
         assert loop.looks == []
 
     with asyncio.Runner(loop_factory=Waking) as runner:

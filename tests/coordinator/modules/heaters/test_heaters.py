@@ -1,6 +1,7 @@
 """Heaters and their commands on virtual nodes, whose plant is the truth about temperatures."""
 
 import asyncio
+import re
 from pathlib import Path
 
 import pytest
@@ -173,9 +174,11 @@ def test_temperature_wait_in_both_directions(tmp_path: Path) -> None:
         await stage.do("TEMPERATURE_WAIT SENSOR=extruder MAXIMUM=80")
         assert stage.true_c() < 82
         await stage.do('TEMPERATURE_WAIT SENSOR="temperature_sensor air" MINIMUM=10 MAXIMUM=40')
-        assert "A:25" in (await stage.do("M105"))[0]
-        air = stage.status("temperature_sensor air")
-        assert air["temperature"] == pytest.approx(25, abs=1)
+        air_c = pytest.approx(25, abs=1)
+        told = re.match(r"A:([\d.]+) ", (await stage.do("M105"))[0])
+        assert told is not None
+        assert float(told[1]) == air_c
+        assert stage.status("temperature_sensor air")["temperature"] == air_c
 
     stage.connected(main)
 
