@@ -27,6 +27,10 @@ from tests.coordinator.motion.steps_harness import (
 from tests.coordinator.motion.steps_oracle import Move, Position, make_move, step_times
 
 
+HOLD_S = 0.05
+"""STEP_HOLD_S: what may be held back, besides a step that may get a neighbour."""
+
+
 def test_clocks_roll_over_on_the_wire() -> None:
     moves = [make_move(10.0, ORIGIN, (30.0, 0.0, 0.0, 0.0), (0.0, 10.0, 0.0), 1000.0)]
     run = Run([stepper(0, X)], [node_spec()])
@@ -137,6 +141,22 @@ def test_small_batches_and_a_full_output_lose_nothing() -> None:
     assert sum(d for _, d in run.steps(0)) == 0
     assert len(run.steps(0)) == 4000 * 48
     run.check_nodes()
+
+
+@pytest.mark.parametrize(("y_mm", "accel"), [(0.6, 50.0), (2.0, 1000.0), (4.0, 200.0), (6.0, 1000.0)])
+def test_a_slow_axis_holds_nothing_back_for_long(y_mm: float, accel: float) -> None:
+    """A move nearly along X: a command of Y may last for long, and those of X behind it wait for it."""
+    moves = [make_move(1.0, ORIGIN, (100.0, y_mm, 0.0, 0.0), (0.0, 50.0, 0.0), accel)]
+    steppers = [stepper(0, X, 0.0125), stepper(1, Y, 0.0125)]
+    wanted = [step_times(s, 168e6, moves, ORIGIN, MAX_ERROR_S) for s in steppers]
+    for border in np.linspace(1.1, moves[0].print_time + moves[0].total_s, 40):
+        run = Run(steppers, [node_spec()])
+        assert run.gen.append(rows(moves), 1) == 1
+        assert run.gen.generate(border)
+        run.collect()
+        for index, steps in enumerate(wanted):
+            left = steps[len(run.steps(index)) :]
+            assert not left or left[0].time > border - 2 * HOLD_S
 
 
 def test_the_ring_says_when_it_is_full() -> None:

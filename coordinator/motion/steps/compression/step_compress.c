@@ -207,6 +207,11 @@ static bool go_on(struct search *q, int level, struct branch *branches, int coun
     return found && ways[0].at == q->count;
 }
 
+// Whether the last segment of WAY, which may be as long as a slow move, has to be on its way.
+static bool is_urgent(const struct search *q, const struct way *way) {
+    return q->s->ticks[q->begin + way->at - way->segment.count] < q->force;
+}
+
 // Returns how many segments the best way has that is certain; the way is the first of that level.
 static int search(struct search *q, double clock, uint32_t expected) {
     q->ways[0][0] = (struct way){.clock = clock, .segment = {.count = expected}};
@@ -214,8 +219,8 @@ static int search(struct search *q, double clock, uint32_t expected) {
     for (int level = 0; level < DEPTH; level++) {
         struct branch branches[WAYS * FIT_ENDS];
         const int count = look_on(q, level, branches);
-        if (count < 0)
-            return level > 1 ? level - 1 : level; // so that the last choice can still be a better one
+        if (count < 0) // the last choice may still become a better one, if it has time
+            return level > 1 && !is_urgent(q, &q->ways[level][0]) ? level - 1 : level;
         if (go_on(q, level, branches, count))
             return level + 1;
         if (!q->found[level + 1])
