@@ -6,16 +6,18 @@ is CLOCK_MONOTONIC in integer nanoseconds; a node's ticks have 64 bits in the ho
 Method: the clock in an answer requested at S and received at R was read after S plus the shortest delay out
 and before R minus the shortest delay back: two bounds on the clock, most of them loose, some tight. The first
 START_SAMPLES are fitted together (start.py), the later ones update a filter that follows temperature
-(fit.py). A slow exchange only gives loose bounds, so no series of them can spoil the estimate.
+(fit.py). A slow exchange only gives loose bounds, so no series of them can spoil the estimate. An answer beyond
+both bounds is impossible and not used, unless several in a row agree: then the clock has jumped, or the host
+has slept.
 """
 
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Final, NewType
+from typing import Final, NamedTuple, NewType
 
 from nodes.clock.blend import Blend
-from nodes.clock.fit import Filter
+from nodes.clock.fit import RATE_SD, Filter
 from nodes.clock.start import START_SAMPLES, Start
 
 HostTime = NewType("HostTime", int)
@@ -32,8 +34,10 @@ SAMPLE_INTERVAL_NS: Final = 984_300_000
 """Not a divisor or multiple of a second: periodic work on a node must not meet every sample."""
 REMEMBERED: Final = 160
 """Number of exchanges among which the fastest is sought."""
-CONTRADICTIONS: Final = 3
-"""After so many consecutive answers that contradict the estimate, it starts again."""
+CONTRADICTIONS: Final = 4
+"""After so many consecutive answers that contradict the estimate, but not each other, it starts again."""
+BROKEN: Final = 8
+"""After so many that contradict each other, too, it is no clock."""
 GAP_NS: Final = 600_000_000_000
 """Silence after which the filter starts again: the temperature may have changed arbitrarily."""
 AHEAD_S: Final = 1.0
@@ -80,6 +84,12 @@ class ClockEstimate:
         return HostTime(self.at_ns + round((ticks - self.at_ticks) * 1e9 / self.freq_hz))
 
 
+class _Reading(NamedTuple):
+    at_ns: HostTime
+    ticks: Ticks
+    round_trip_s: float
+
+
 class ClockEstimator:
     """Estimates one node's clock. NOMINAL_FREQ_HZ > 0 comes from its dictionary.
 
@@ -95,15 +105,23 @@ class ClockEstimator:
         self._zero_ticks: int
         self._start: Start
         self._filter: Blend | None
-        self._contradictions: int
+        self._impossible: deque[_Reading] = deque(maxlen=CONTRADICTIONS)
+        """The last ones, since the last possible one."""
+        self._contradictions = 0
+        """How many there were."""
         self.accepted = 0
         self.unusable = 0
-        """Number of answers whose times are unknown (a repeated block) or implausible."""
+        """Number of answers whose times are unknown (a repeated block), implausible or impossible."""
 
     @property
     def ready(self) -> bool:
         """Whether there are enough samples for planning, which reaches two seconds ahead."""
         return self.accepted >= SETTLE_SAMPLES
+
+    @property
+    def broken(self) -> bool:
+        """Whether what is read is no clock: it contradicts the estimate, and itself, again and again."""
+        return self._contradictions >= BROKEN
 
     @property
     def round_trip_s(self) -> float:
@@ -139,7 +157,8 @@ class ClockEstimator:
         """Return when to query the node again after a query at NOW_NS."""
         if self.accepted < BURST_SAMPLES:
             return now_ns + BURST_INTERVAL_NS
-        return now_ns + (SETTLE_INTERVAL_NS if self.accepted < SETTLE_SAMPLES else SAMPLE_INTERVAL_NS)
+        in_doubt = self._contradictions or self.accepted < SETTLE_SAMPLES
+        return now_ns + (SETTLE_INTERVAL_NS if in_doubt else SAMPLE_INTERVAL_NS)
 
     # ------------------------------------------------------------------------------------------------- fit
 
@@ -150,12 +169,16 @@ class ClockEstimator:
             self.unusable += 1
             return False
         round_trip_s = (received_ns - sent_ns) * 1e-9
-        if (
-            last is None
-            or middle_ns - last.at_ns > GAP_NS
-            or self._impossible(last, middle_ns, ticks, round_trip_s)
-        ):
+        if last is None or middle_ns - last.at_ns > GAP_NS:
             self._restart(middle_ns, ticks)
+        elif self._is_impossible(last, middle_ns, ticks, round_trip_s):
+            self._contradictions += 1
+            self._impossible.append(_Reading(middle_ns, ticks, round_trip_s))
+            if not self._has_jumped(last.freq_hz):
+                self.unusable += 1
+                return False
+            self._restart(middle_ns, ticks)
+        self._forget_contradictions()
         self._round_trips_s.append(round_trip_s)
         self.accepted += 1
         self._fit(middle_ns, ticks, round_trip_s)
@@ -166,17 +189,28 @@ class ClockEstimator:
         self._zero_ns, self._zero_ticks = middle_ns, ticks
         self._start, self._filter = Start(), None
         self._round_trips_s.clear()
-        self._contradictions = 0
 
-    def _impossible(
+    def _is_impossible(
         self, last: ClockEstimate, middle_ns: HostTime, ticks: Ticks, round_trip_s: float
     ) -> bool:
-        """Whether this reading, like those before it, cannot lie between query and answer."""
+        """Whether this reading cannot lie between query and answer."""
         off_s = abs(ticks - last.ticks_at(middle_ns)) / self._freq_hz
         age_s = (middle_ns - last.at_ns) * 1e-9
-        allowed_s = round_trip_s / 2 + last.error_s * (1 + age_s / AHEAD_S)
-        self._contradictions = self._contradictions + 1 if off_s > allowed_s else 0
-        return self._contradictions >= CONTRADICTIONS
+        return off_s > round_trip_s / 2 + last.error_s * (1 + age_s / AHEAD_S)
+
+    def _has_jumped(self, freq_hz: float) -> bool:
+        """Whether CONTRADICTIONS impossible readings are those of one clock."""
+        first, *others = self._impossible
+        for other in others:
+            passed_s = (other.at_ns - first.at_ns) * 1e-9
+            off_s = abs((other.ticks - first.ticks) / freq_hz - passed_s)
+            if off_s > (first.round_trip_s + other.round_trip_s) / 2 + RATE_SD * passed_s:
+                return False
+        return len(self._impossible) == CONTRADICTIONS
+
+    def _forget_contradictions(self) -> None:
+        self._impossible.clear()
+        self._contradictions = 0
 
     def _fit(self, middle_ns: HostTime, ticks: Ticks, round_trip_s: float) -> None:
         faded_s = 0.0

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Final
 
-from nodes.clock.clock import ClockEstimate, ClockEstimator
+from nodes.clock.clock import BROKEN, ClockEstimate, ClockEstimator
 from nodes.clock.wire_time import narrow
 from nodes.node.connector import ClockConnector
 from nodes.node.request_reply import Answer, QueryTimeout, RequestReply
@@ -13,6 +13,11 @@ from nodes.support.errors import CanductorError
 
 SLACK: Final = 0.1
 """By how much of the time between two samples the next may be later."""
+
+_BROKEN: Final = (
+    f"its clock is none: {BROKEN} readings in a row were impossible, each another way; check the board's supply and"
+    " its firmware"
+)
 
 
 class ClockKeeper:
@@ -60,6 +65,9 @@ class ClockKeeper:
         while True:
             try:
                 self._sampled(await self._ask())
+                if self.estimator.broken:
+                    self._on_lost(_BROKEN)
+                    return
                 await self._on_sample()
             except QueryTimeout:
                 self._connector.suspect()  # the link decides when a silent node is lost

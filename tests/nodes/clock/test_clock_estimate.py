@@ -179,23 +179,63 @@ def test_only_the_last_160_exchanges_are_remembered() -> None:
 # --------------------------------------------------------------------------------------- when it begins again
 
 
-def test_three_impossible_answers_in_a_row_begin_the_estimate_again() -> None:
+def test_impossible_answers_in_a_row_that_agree_begin_the_estimate_again() -> None:
     exact = Exact()
     assert exact.knows_nothing
     exact.follow(63)
 
     def take_wrong(seconds: int, *, trip_ns: int = TRIP_NS) -> bool:
         exact.now_ns += SECOND_NS
-        assert exact.take(wrong_ticks=seconds * FREQ_HZ, trip_ns=trip_ns)
-        return exact.estimator.estimate().at_ticks == exact.ticks(exact.now_ns) + seconds * FREQ_HZ
+        before = exact.estimator.estimate()
+        taken = exact.take(wrong_ticks=seconds * FREQ_HZ, trip_ns=trip_ns)
+        after = exact.estimator.estimate()
+        assert taken or after == before, "what is impossible changes nothing"
+        assert not taken or after.at_ticks == exact.ticks(exact.now_ns) + seconds * FREQ_HZ
+        return taken
 
-    assert [take_wrong(1), take_wrong(1)] == [False, False]
+    assert [take_wrong(1) for _ in range(3)] == [False, False, False]
+    assert exact.estimator.unusable == 3
     exact.follow(1)  # a possible one between
-    assert [take_wrong(1), take_wrong(1)] == [False, False]
+    assert [take_wrong(1) for _ in range(3)] == [False, False, False]
     assert take_wrong(1, trip_ns=2 * TRIP_NS)
     assert exact.estimator.round_trip_s == pytest.approx(2 * TRIP_NS * 1e-9)
-    assert [take_wrong(9), take_wrong(9), take_wrong(9)] == [False, False, True]  # counted from 0 again
+    assert [take_wrong(9) for _ in range(4)] == [False, False, False, True]  # counted from 0 again
     assert exact.knows_nothing
+
+
+def test_impossible_answers_that_contradict_each_other_are_no_clock() -> None:
+    exact = Exact()
+    exact.follow(63)
+    known = exact.estimator.estimate()
+
+    def take_wrong(wrong_ns: int) -> None:
+        exact.now_ns = exact.estimator.next_sample_ns(exact.now_ns)
+        assert not exact.estimator.broken
+        assert not exact.take(wrong_ticks=wrong_ns // 10)
+        assert exact.estimator.estimate() == known
+
+    for count in range(7):
+        take_wrong(SECOND_NS + count % 2 * 2 * TRIP_NS)
+    exact.follow(1)
+    known = exact.estimator.estimate()
+    begun_ns = exact.now_ns
+    for count in range(8):
+        take_wrong(SECOND_NS + count % 2 * 2 * TRIP_NS)
+    assert exact.estimator.broken
+    assert exact.now_ns - begun_ns == 984_300_000 + 7 * 50_000_000, "asked again soon while it is in doubt"
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_impossible_answers_agree_within_their_exchanges_and_what_a_rate_may_be_off(direction: int) -> None:
+    for inside, agree in ((0.98, True), (1.02, False)):
+        exact = Exact()
+        exact.follow(63)
+        for count in range(4):
+            exact.now_ns += SECOND_NS
+            # The last one is compared to the first, 3 s before: half of both exchanges, and 150 ppm.
+            apart_ns = round(direction * inside * (TRIP_NS + 450_000)) if count == 3 else 0
+            taken = exact.take(wrong_ticks=(SECOND_NS + apart_ns) // 10)
+            assert taken is (agree and count == 3)
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -207,7 +247,7 @@ def test_an_answer_is_possible_within_its_exchange_and_the_bound_which_grows_wit
     for inside, restarts in ((0.98, False), (1.02, True)):
         exact = Exact()
         exact.follow(3)
-        for count in range(3):
+        for count in range(4):
             exact.now_ns = exact.estimator.estimate().at_ns + round(age_s * SECOND_NS)
             estimate = exact.estimator.estimate()
             trip_ns = round(estimate.error_s * 1e9)
@@ -215,9 +255,10 @@ def test_an_answer_is_possible_within_its_exchange_and_the_bound_which_grows_wit
             there = estimate.ticks_at(HostTime(exact.now_ns)) + round(
                 direction * inside * allowed_s * FREQ_HZ
             )
-            assert exact.take(wrong_ticks=there - exact.ticks(exact.now_ns), trip_ns=trip_ns)
+            taken = exact.take(wrong_ticks=there - exact.ticks(exact.now_ns), trip_ns=trip_ns)
+            assert taken is (not restarts or count == 3)
             begun_again = exact.estimator.estimate().freq_hz == FREQ_HZ  # the nominal rate
-            assert begun_again is (restarts and count == 2)
+            assert begun_again is (restarts and count == 3)
 
 
 def test_a_silence_of_ten_minutes_is_bridged_and_a_longer_one_is_not() -> None:
