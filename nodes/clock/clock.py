@@ -6,9 +6,9 @@ is CLOCK_MONOTONIC in integer nanoseconds; a node's ticks have 64 bits in the ho
 Method: the clock in an answer requested at S and received at R was read after S plus the shortest delay out
 and before R minus the shortest delay back: two bounds on the clock, most of them loose, some tight. The first
 START_SAMPLES are fitted together (start.py), the later ones update a filter that follows temperature
-(fit.py). A slow exchange only gives loose bounds, so no series of them can spoil the estimate. An answer beyond
-both bounds is impossible and not used, unless several in a row agree: then the clock has jumped, or the host
-has slept.
+(fit.py). A slow exchange only gives loose bounds, so no series of them can spoil the estimate. An answer
+beyond both bounds is impossible and not used, unless several in a row agree: then the clock has jumped, or
+the host has slept.
 """
 
 import math

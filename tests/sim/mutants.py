@@ -23,7 +23,8 @@ from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 LIST: Final = Path(__file__).with_name("mutants.toml")
-TIMEOUT_S: Final = 240.0
+TIMEOUT_S: Final = 3600.0
+"""After it something hangs; a busy computer needs minutes for what the project itself has to pass."""
 SIMULATION_SHARE: Final = 0.5
 """At least this part of all planted bugs the simulation has to see."""
 COPIED: Final = (

@@ -26,7 +26,6 @@ from tests.coordinator.motion.steps_harness import (
 )
 from tests.coordinator.motion.steps_oracle import Move, Position, make_move, step_times
 
-
 HOLD_S = 0.05
 """STEP_HOLD_S: what may be held back, besides a step that may get a neighbour."""
 

@@ -30,7 +30,7 @@ class Node:
         return round((at_ns - self.zero_ns) * 1e-9 * FREQ_HZ * (1 + 50e-6))
 
     def sample(self, *, wrong_s: float = 0.0, begin: bool = False, used: bool = True) -> None:
-        """Ask once, as often as the estimator asks for it; the answer is wrong by WRONG_S, and USED or not."""
+        """Ask once, as often as the estimator asks for it; the answer is wrong by WRONG_S, USED or not."""
         out_ns, back_ns = (150_000 + round(self._random.expovariate(1 / 50_000)) for _ in range(2))
         clock = self.ticks(self.now_ns + out_ns) + round(wrong_s * FREQ_HZ)
         received_ns = self.now_ns + out_ns + back_ns
