@@ -37,7 +37,7 @@ REMEMBERED: Final = 160
 CONTRADICTIONS: Final = 4
 """After so many consecutive answers that contradict the estimate, but not each other, it starts again."""
 BROKEN: Final = 8
-"""After so many that contradict each other, too, it is no clock."""
+"""After so many that contradict each other, too, the clock is unusable."""
 GAP_NS: Final = 600_000_000_000
 """Silence after which the filter starts again: the temperature may have changed arbitrarily."""
 AHEAD_S: Final = 1.0
@@ -120,7 +120,7 @@ class ClockEstimator:
 
     @property
     def broken(self) -> bool:
-        """Whether what is read is no clock: it contradicts the estimate, and itself, again and again."""
+        """Whether the clock is unusable: it contradicts the estimate, and itself, again and again."""
         return self._contradictions >= BROKEN
 
     @property

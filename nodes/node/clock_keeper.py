@@ -15,8 +15,8 @@ SLACK: Final = 0.1
 """By how much of the time between two samples the next may be later."""
 
 _BROKEN: Final = (
-    f"its clock is none: {BROKEN} readings in a row were impossible, each another way; check the board's"
-    " supply and its firmware"
+    f"its clock is unusable: {BROKEN} readings in a row contradict the estimate and each other; check"
+    " the board's supply and its firmware"
 )
 
 

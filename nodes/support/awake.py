@@ -13,7 +13,7 @@ class WakingLoop(ABC):
     def when_awake(self, call: Callable[[], None], *, also_by: int | None = None) -> Callable[[], None]:
         """Call CALL whenever the loop has woken up and nobody waits for it; return what ends that.
 
-        Nobody waits for what comes from the descriptor ALSO_BY, or is there for whom others need not wait.
+        Events of the descriptor ALSO_BY count as such: what they bring is handled before CALL's work.
         """
 
     @abstractmethod

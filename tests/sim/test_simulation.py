@@ -28,6 +28,21 @@ def test_a_scenario_holds(entry: scenario.Scenario) -> None:
         assert result.steps == result.planned > 1000
 
 
+@pytest.mark.parametrize(
+    ("name", "seed", "cause"),
+    [
+        ("clock_random", 494, "lost node toolhead: its clock is unusable: 8 readings in a row contradict"),
+        ("clock_random", 526, "lost node toolhead: its clock is unusable: 8 readings in a row contradict"),
+        ("cut_long", 981, "lost node toolhead: can0 node 5: lost, no acknowledgement"),
+    ],
+)
+def test_what_a_seed_once_found(name: str, seed: int, cause: str) -> None:
+    """An axis followed a clock that lies; a long command of a slow axis was sent too late."""
+    result = play(scenario.find(name), seed)
+    assert result.ok, result.to_text()
+    assert cause in result.to_text()
+
+
 @pytest.mark.parametrize("name", ["loss_5_percent", "bad_day"])
 def test_a_seed_decides_everything(name: str) -> None:
     entry = scenario.find(name)

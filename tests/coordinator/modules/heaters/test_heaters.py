@@ -175,9 +175,9 @@ def test_temperature_wait_in_both_directions(tmp_path: Path) -> None:
         assert stage.true_c() < 82
         await stage.do('TEMPERATURE_WAIT SENSOR="temperature_sensor air" MINIMUM=10 MAXIMUM=40')
         air_c = pytest.approx(25, abs=1)
-        told = re.match(r"A:([\d.]+) ", (await stage.do("M105"))[0])
-        assert told is not None
-        assert float(told[1]) == air_c
+        found = re.match(r"A:([\d.]+) ", (await stage.do("M105"))[0])
+        assert found is not None
+        assert float(found[1]) == air_c
         assert stage.status("temperature_sensor air")["temperature"] == air_c
 
     stage.connected(main)
