@@ -6,6 +6,10 @@
 // empty block with the unchanged number, which the host takes as "not this one". Each answer carries the
 // number too.
 //
+// A host repeats a block byte by byte. A repeat that differs from the block it would be a repeat of shows
+// that another host has sent that one, and that the commands in this one would be lost: the node shuts down.
+// Only a host that has just begun may take a number by chance; it begins after a pause.
+//
 // Back-pressure: a command only starts while the transmit buffer has room for a response. Otherwise its block
 // waits, half executed, until bytes have left; new bytes gather in the receive buffer, whose size the host
 // knows.
@@ -19,8 +23,11 @@ DECL_CONSTANT("RECEIVE_WINDOW", 192);
 DECL_STATIC_STRING(invalid_command, "Invalid command");
 DECL_STATIC_STRING(parser_error, "Command parser error");
 DECL_STATIC_STRING(encode_error, "Message encode error");
+DECL_STATIC_STRING(second_host, "Another host sends to this node");
 
 DECL_RESPONSE(is_shutdown, "is_shutdown static_string_id=%hu");
+
+enum { REPEATS_PER_SECOND = 10 }; // at least: a block that comes later is not taken for a repeat
 
 _Static_assert(NODE_RECEIVE_WINDOW == 192, "the constant above tells the host");
 _Static_assert((NODE_TRANSMIT_SIZE & (NODE_TRANSMIT_SIZE - 1)) == 0, "the ring is indexed by a mask");
@@ -148,14 +155,32 @@ static int execute_block(struct node *node) {
     return 1;
 }
 
+static uint16_t checksum_of(const uint8_t *block, size_t size) {
+    return (uint16_t)(block[size - WIRE_TRAILER] << 8 | block[size - WIRE_TRAILER + 1]);
+}
+
+// Is the sound block at the front, of the last accepted block's number, another one than that? An empty block
+// loses nothing.
+static int contradicts(const struct node *node, size_t size, uint32_t now) {
+    return size > WIRE_BLOCK_MIN && node->objects.finalized && !node->config.legacy &&
+           now - node->rx.accepted_clock < node->config.clock_freq / REPEATS_PER_SECOND &&
+           checksum_of(node->rx.buffer, size) != node->rx.accepted_checksum;
+}
+
 static void judge_block(struct node *node, size_t size) {
-    if ((node->rx.buffer[1] & WIRE_SEQ_MASK) != node->rx.expected) {
+    uint8_t number = node->rx.buffer[1] & WIRE_SEQ_MASK;
+    uint32_t now = board_clock(node);
+    if (number != node->rx.expected) {
         node->stats.rx_out_of_order++;
+        if (number == ((node->rx.expected - 1) & WIRE_SEQ_MASK) && contradicts(node, size, now))
+            node_shutdown(node, STRING(second_host));
         acknowledge(node);
         consume(node, size);
         return;
     }
     node->stats.rx_blocks++;
+    node->rx.accepted_checksum = checksum_of(node->rx.buffer, size);
+    node->rx.accepted_clock = now;
     node->rx.expected = (node->rx.expected + 1) & WIRE_SEQ_MASK;
     node->rx.block_size = (uint8_t)size;
     node->rx.block_at = WIRE_HEADER;

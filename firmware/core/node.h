@@ -175,10 +175,12 @@ struct node {
     } shutdown;
     struct {
         uint8_t buffer[NODE_RECEIVE_WINDOW];
-        uint16_t size;      // bytes in buffer
-        uint8_t block_size; // of the accepted block at the front that is being executed; 0: none
-        uint8_t block_at;   // its next command
-        uint8_t expected;   // sequence number, 4 bits
+        uint16_t size;              // bytes in buffer
+        uint8_t block_size;         // of the accepted block at the front that is being executed; 0: none
+        uint8_t block_at;           // its next command
+        uint8_t expected;           // sequence number, 4 bits
+        uint16_t accepted_checksum; // of the last accepted block
+        uint32_t accepted_clock;
         struct wire_scanner scanner;
     } rx;
     struct {

@@ -26,6 +26,10 @@ _ADVICE: Final = {
         "another board was given its node id, by another host on this bus or with a copy of its uuid; "
         "let only one host assign ids, and restart the board"
     ),
+    "Another host sends to this node": (
+        "blocks of the same number and of different content reached it; "
+        "let only one host use this wire, and restart the board"
+    ),
 }
 """Advice for shutdowns whose reason does not suggest one."""
 

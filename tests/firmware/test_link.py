@@ -82,6 +82,44 @@ def test_duplicates_and_blocks_out_of_order_are_refused_with_the_expected_number
     assert host.ask("debug_ping data=0203").args == {"data": b"\x02\x03"}
 
 
+def pings(host: Host) -> tuple[bytes, bytes]:
+    host.configure()
+    return host.words.encode("debug_ping data=01"), host.words.encode("debug_ping data=02")
+
+
+def said(host: Host) -> list[str]:
+    host.receive()
+    return [host.text(a) if a.name == "shutdown" else a.name for a in host.unasked]
+
+
+def test_a_repeat_with_other_content_shows_a_second_host() -> None:
+    host = Host()
+    other, own = pings(host)
+    for content in (other, other, b""):
+        host.write(wire_twin.block(host.seq, content))
+    assert said(host) == ["pong"]
+    host.write(wire_twin.block(host.seq, own))
+    assert said(host) == ["pong", "Another host sends to this node"]
+
+
+def test_who_begins_or_is_ahead_is_no_second_host() -> None:
+    host = Host()
+    first, second = pings(host)
+    host.write(wire_twin.block(host.seq, first))
+    for ahead in range(2, 16):
+        host.write(wire_twin.block(host.seq + ahead, second))
+    host.node.run_until(host.now + host.node.clock_freq // 10)
+    host.write(wire_twin.block(host.seq, second))
+    assert said(host) == ["pong"]
+
+
+def test_a_node_that_is_not_configured_has_nothing_to_lose() -> None:
+    host = Host()
+    for data in ("01", "02"):
+        host.write(wire_twin.block(host.seq, host.words.encode(f"debug_ping data={data}")))
+    assert said(host) == ["pong"]
+
+
 def test_every_single_damaged_byte_costs_one_nak_and_nothing_else() -> None:
     host = Host()
     good = wire_twin.block(host.seq, host.words.encode("debug_ping data=0102030405"))

@@ -47,7 +47,7 @@ const uint16_t string_timer_too_close = 1, string_timer_in_past = 2, string_comm
                string_not_shutdown = 4, string_invalid_command = 5, string_parser_error = 6,
                string_encode_error = 7, string_move_overflow = 8, string_alloc_failed = 9,
                string_oids_allocated = 10, string_cannot_assign_oid = 11, string_invalid_oid_type = 12,
-               string_already_finalized = 13, string_debug_address = 14;
+               string_already_finalized = 13, string_debug_address = 14, string_second_host = 15;
 
 static const uint8_t types_shutdown[] = {WIRE_U32, WIRE_U16};
 const struct node_response response_shutdown = {.types = types_shutdown, .id = 20, .arg_count = 2};

@@ -183,7 +183,7 @@ static size_t gather(struct fuzz *fuzz, size_t size, size_t gathered) {
             CHECK(memcmp(record + 9, uuid, sizeof(uuid)) == 0);
             fuzz->replies++;
         } else {
-            CHECK(id == 0x10 ? record[4] == 2 : id - 0x20 < TRIGGER_GROUPS && record[8] == id - 0x20);
+            CHECK(id == 0x10 ? record[4] == 6 : id - 0x20 < TRIGGER_GROUPS && record[8] == id - 0x20);
             fuzz->signals++;
         }
     }
