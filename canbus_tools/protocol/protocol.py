@@ -207,6 +207,8 @@ ADMIN_FRAMES: Final = (
 )
 """Frames that assign node ids and synchronise clocks; distinguished by their id and first byte."""
 
+_SIGNAL_CLOCK: Final = "clock of the sender when it triggered or shut down; of a host 0"
+
 SIGNAL_FRAMES: Final = (
     FrameFormat(
         name="bus_stop",
@@ -219,6 +221,7 @@ SIGNAL_FRAMES: Final = (
                 sentence="number of the reason in the origin's enumeration static_string_id; 0: none given",
             ),
             Field(name="origin", size=1, sentence="node id of the sender", values={0: "host"}),
+            Field(name="clock", size=4, sentence=_SIGNAL_CLOCK),
         ),
         extension=True,
         sentence="Emergency stop of the whole bus: receivers shut down from the receive interrupt.",
@@ -231,7 +234,7 @@ SIGNAL_FRAMES: Final = (
         fields=(
             Field(name="group", size=1, sentence="the stop group, also the id less 0x020"),
             Field(name="reason", size=1, sentence="what trsync_state reports as trigger_reason"),
-            Field(name="clock", size=4, sentence="clock of the sender when it triggered"),
+            Field(name="clock", size=4, sentence=_SIGNAL_CLOCK),
         ),
         extension=True,
         sentence="A trsync triggered: every node whose trsync joined the group stops at once.",

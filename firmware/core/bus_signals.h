@@ -3,7 +3,7 @@
 // pulse at which all nodes latch their clocks. They act in the receive interrupt and leave from interrupt
 // context; with ids below CAN_ID_URGENT_END they win against all data.
 //
-//   id 0x010         reason, origin's node id        receivers shut down, and do not pass it on
+//   id 0x010         reason, origin's id and clock   receivers shut down, and do not pass it on
 //   id 0x020 + group group, reason, origin's clock   every armed trsync of that group triggers
 //   admin 0x40       sequence number 1..255          every node latches its clock
 //
@@ -28,7 +28,7 @@ struct bus_signals {
     uint16_t triggers_waiting; // a bit for each group
     uint8_t stop_waiting, stop_reason, stop_origin;
     uint8_t pulse_seq; // 0: there was none yet
-    uint32_t pulse_clock;
+    uint32_t stop_clock, pulse_clock;
 };
 
 // A frame with an urgent id came. Interrupt context.

@@ -17,7 +17,7 @@ DECL_STATIC_STRING(command_request, "Command request");
 DECL_RESPONSE(sync_pulse, "sync_pulse seq=%c clock=%u");
 
 enum { ID_STOP = 0x010, ID_TRIGGER = 0x020 };
-enum { STOP_SIZE = 2, TRIGGER_SIZE = 6, PULSE_SIZE = 2 };
+enum { SIGNAL_SIZE = 6, PULSE_SIZE = 2 };
 
 // ------------------------------------------------------------------------------------------------- receiving
 
@@ -27,7 +27,7 @@ void bus_signals_receive(struct node *node, uint32_t id, const uint8_t *data, si
     // The stop is obeyed whatever the frame carries: reason and origin are for whoever looks on.
     if (id == ID_STOP)
         node_shutdown(node, STRING(bus_stop));
-    else if (id - ID_TRIGGER < TRIGGER_GROUPS && size >= TRIGGER_SIZE && data[0] == id - ID_TRIGGER)
+    else if (id - ID_TRIGGER < TRIGGER_GROUPS && size >= SIGNAL_SIZE && data[0] == id - ID_TRIGGER)
         trsync_trigger_group(node, data[0], data[1]);
 }
 
@@ -43,24 +43,23 @@ void bus_signals_pulse(struct node *node, const uint8_t *data, size_t size) {
 
 // --------------------------------------------------------------------------------------------------- sending
 
+// Two bytes and a clock.
+static int send_signal(struct node *node, uint32_t id, uint8_t first, uint8_t second, uint32_t clock) {
+    const uint8_t data[SIGNAL_SIZE] = {
+        first, second, (uint8_t)clock, (uint8_t)(clock >> 8), (uint8_t)(clock >> 16), (uint8_t)(clock >> 24),
+    };
+    return board_can_send(node, id, data, sizeof(data));
+}
+
 static int send_stop(struct node *node) {
     const struct bus_signals *signals = &node->can->signals;
-    const uint8_t data[STOP_SIZE] = {signals->stop_reason, signals->stop_origin};
-    return board_can_send(node, ID_STOP, data, sizeof(data));
+    return send_signal(node, ID_STOP, signals->stop_reason, signals->stop_origin, signals->stop_clock);
 }
 
 static int send_trigger(struct node *node, uint8_t group) {
     const struct bus_signals *signals = &node->can->signals;
-    uint32_t clock = signals->triggers[group].clock;
-    const uint8_t data[TRIGGER_SIZE] = {
-        group,
-        signals->triggers[group].reason,
-        (uint8_t)clock,
-        (uint8_t)(clock >> 8),
-        (uint8_t)(clock >> 16),
-        (uint8_t)(clock >> 24),
-    };
-    return board_can_send(node, (uint32_t)ID_TRIGGER + group, data, sizeof(data));
+    return send_signal(node, (uint32_t)ID_TRIGGER + group, group, signals->triggers[group].reason,
+                       signals->triggers[group].clock);
 }
 
 void bus_signals_trigger(struct node *node, uint8_t group, uint8_t reason, uint32_t clock) {
@@ -104,6 +103,7 @@ void bus_signals_shutdown(struct node *node) {
     struct bus_signals *signals = &node->can->signals;
     signals->stop_reason = reason > UINT8_MAX ? 0 : (uint8_t)reason;
     signals->stop_origin = node->can->node_id;
+    signals->stop_clock = node->shutdown.clock;
     signals->stop_waiting = send_stop(node) != 0;
 }
 DECL_SHUTDOWN_HOOK(bus_signals_shutdown);

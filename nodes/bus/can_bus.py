@@ -24,6 +24,7 @@ from nodes.support.can_protocol import (
     ADMIN_ID,
     ADMIN_RESPONSE_ID,
     BUS_OFF,
+    BUS_STOP,
     BUS_STOP_ID,
     FIRST_DATA_ID,
     QUERY_UNASSIGNED,
@@ -106,7 +107,7 @@ class CanBus(BusBase):
         if any(node.dictionary.int_constant(KNOWS_BUS_STOP, 0) for node in self.nodes):
             with contextlib.suppress(CanductorError):  # the bus may be what failed
                 for _ in range(BUS_STOP_FRAMES):
-                    self.io.send_frame(BUS_STOP_ID, bytes((0, 0)))
+                    self.io.send_frame(BUS_STOP_ID, bytes(BUS_STOP.size))
         super().emergency_stop()
 
     async def assign(self, uuids: Iterable[Uuid]) -> Assignment:
@@ -191,8 +192,8 @@ class CanBus(BusBase):
     def _handle_frame(self, frame: Frame) -> None:
         if self._assignment is not None:
             self._assignment.frame(frame.can_id, frame.data, _ns(asyncio.get_running_loop().time()))
-        if frame.can_id == BUS_STOP_ID and len(frame.data) == 2:
-            self._bus_stopped(reason=frame.data[0], nodeid=frame.data[1])
+        if frame.can_id == BUS_STOP_ID and len(frame.data) == BUS_STOP.size:
+            self._bus_stopped(*BUS_STOP.unpack(frame.data))
         elif frame.can_id == ADMIN_RESPONSE_ID:
             self._doubt(waiting_uuid(frame.data))
         elif frame.can_id == BUS_OFF:
@@ -200,11 +201,11 @@ class CanBus(BusBase):
         elif frame.can_id in self._to_nodes:
             self._has_another_host(self._to_nodes[frame.can_id], frame.can_id)
 
-    def _bus_stopped(self, reason: int, nodeid: int) -> None:
+    def _bus_stopped(self, reason: int, nodeid: int, clock: int) -> None:
         """Record that a node stopped the bus: later reports of the other nodes are consequences."""
         for uuid, node in self._by_uuid.items():
             if self._nodeids[uuid] == nodeid:
-                node.stopped_the_bus(reason)
+                node.stopped_the_bus(reason, clock)
 
     def _has_another_host(self, node: Node, can_id: int) -> None:
         """Stop and lose NODE, because a frame to it was received, and a host does not receive its own frames.

@@ -38,6 +38,9 @@ CONTRADICTIONS: Final = 4
 """After so many consecutive answers that contradict the estimate, but not each other, it starts again."""
 BROKEN: Final = 8
 """After so many that contradict each other, too, the clock is unusable."""
+JUMP_S: Final = 1e-3
+"""From so far off on, a clock whose estimate begins again has jumped. A host whose own clock is slewed, by
+500 ppm at most as usual, is less than that off by then."""
 GAP_NS: Final = 600_000_000_000
 """Silence after which the filter starts again: the temperature may have changed arbitrarily."""
 AHEAD_S: Final = 1.0
@@ -109,6 +112,10 @@ class ClockEstimator:
         """The last ones, since the last possible one."""
         self._contradictions = 0
         """How many there were."""
+        self.jumps = 0
+        """How often the clock has jumped since it was first known."""
+        self.jump_s = 0.0
+        """By how much it did the last time."""
         self.accepted = 0
         self.unusable = 0
         """Number of answers whose times are unknown (a repeated block), implausible or impossible."""
@@ -153,6 +160,13 @@ class ClockEstimator:
         """Return the host time at which the node's clock shows TICKS."""
         return self.estimate().ns_at(ticks)
 
+    def ahead_s(self, now_ns: int, clock32: int) -> float:
+        """Return by how much a clock that was read before NOW_NS is ahead of all it can be; 0: it is not."""
+        last = self.estimate()
+        ticks = extend32(clock32, last.ticks_at(HostTime(now_ns)))
+        ahead_s = (ticks - last.ticks_at(HostTime(now_ns))) / self._freq_hz
+        return ahead_s if ahead_s > last.asymmetry_s + self._error_s(last, now_ns) else 0.0
+
     def next_sample_ns(self, now_ns: int) -> int:
         """Return when to query the node again after a query at NOW_NS."""
         if self.accepted < BURST_SAMPLES:
@@ -177,6 +191,7 @@ class ClockEstimator:
             if not self._has_jumped(last.freq_hz):
                 self.unusable += 1
                 return False
+            self._note_jump((ticks - last.ticks_at(middle_ns)) / self._freq_hz)
             self._restart(middle_ns, ticks)
         self._forget_contradictions()
         self._round_trips_s.append(round_trip_s)
@@ -195,8 +210,12 @@ class ClockEstimator:
     ) -> bool:
         """Whether this reading cannot lie between query and answer."""
         off_s = abs(ticks - last.ticks_at(middle_ns)) / self._freq_hz
-        age_s = (middle_ns - last.at_ns) * 1e-9
-        return off_s > round_trip_s / 2 + last.error_s * (1 + age_s / AHEAD_S)
+        return off_s > round_trip_s / 2 + self._error_s(last, middle_ns)
+
+    @staticmethod
+    def _error_s(estimate: ClockEstimate, at_ns: int) -> float:
+        """Return the bound of the error at AT_NS, after the estimate."""
+        return estimate.error_s * (1 + (at_ns - estimate.at_ns) * 1e-9 / AHEAD_S)
 
     def _has_jumped(self, freq_hz: float) -> bool:
         """Whether CONTRADICTIONS impossible readings are those of one clock."""
@@ -207,6 +226,11 @@ class ClockEstimator:
             if off_s > (first.round_trip_s + other.round_trip_s) / 2 + RATE_SD * passed_s:
                 return False
         return len(self._impossible) == CONTRADICTIONS
+
+    def _note_jump(self, jump_s: float) -> None:
+        if abs(jump_s) >= JUMP_S:
+            self.jumps += 1
+            self.jump_s = jump_s
 
     def _forget_contradictions(self) -> None:
         self._impossible.clear()

@@ -24,7 +24,7 @@ REQUIRED_RESPONSES: Final = {
 }
 OPTIONAL_RESPONSES: Final = {
     "stats": ("count", "sum", "sumsq"),
-    "shutdown": ("static_string_id",),
+    "shutdown": ("clock", "static_string_id"),
     "is_shutdown": ("static_string_id",),
     "stepper_position": ("oid", "pos"),
 }

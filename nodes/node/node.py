@@ -113,7 +113,7 @@ class Node:
         for response, handler in (
             ("stats", self._handle_stats),
             ("shutdown", self._handle_shutdown),
-            ("is_shutdown", self._handle_shutdown),
+            ("is_shutdown", self._handle_is_shutdown),
             ("starting", self._handle_starting),
         ):
             self._talk.on(response, None, handler)
@@ -557,10 +557,13 @@ class Node:
         self.load = load_of(stats, self.dictionary.clock_freq_hz, base)
 
     def _handle_shutdown(self, message: Message) -> None:
+        self.shut_down_for(message.integer("static_string_id"), message.integer("clock"))
+
+    def _handle_is_shutdown(self, message: Message) -> None:
         self.shut_down_for(message.integer("static_string_id"))
 
-    def stopped_the_bus(self, static_string_id: int) -> None:
-        """Record that the node shut down and stopped all others, as a frame on the bus says.
+    def stopped_the_bus(self, static_string_id: int, clock: int) -> None:
+        """Record that the node shut down at its CLOCK and stopped all others, as a frame on the bus says.
 
         A frame with a number that the node's firmware does not have is forged, or the reason did not fit:
         then the nodes' own reports count.
@@ -568,16 +571,28 @@ class Node:
         if self.state in _SHUTDOWN_MEANS:
             known = self.dictionary.enumerations.get("static_string_id")
             if known is not None and known.name_of(static_string_id) is not None:
-                self.shut_down_for(static_string_id)
+                self.shut_down_for(static_string_id, clock)
 
-    def shut_down_for(self, static_string_id: int) -> None:
-        """Record that the node shut down, and the text that it gives as the reason."""
+    def shut_down_for(self, static_string_id: int, clock: int | None = None) -> None:
+        """Record that the node shut down (at its CLOCK, if known), and the text of its reason."""
         if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:
             return
         text = self.dictionary.enum_name("static_string_id", static_string_id)
         known = [words for explain in self._explain if (words := explain(text))]
+        ahead_s = 0.0 if clock is None else self._clock_ahead_s(clock)
+        if ahead_s:
+            known.append(
+                f"its clock was {ahead_s * 1e3:.1f} ms ahead of what the host knows of it: "
+                "its oscillator is failing, or the host was suspended"
+            )
         sentence = shutdown_sentence(self.name, text) + (f" ({'; '.join(known)})" if known else "")
         self._fail(NodeEvent.SHUTDOWN, NodeShutdown(sentence))
+
+    def _clock_ahead_s(self, clock: int) -> float:
+        """Return by how much a CLOCK that the node has read before now is ahead of what it can be."""
+        if self._keeper is None or not self._keeper.estimator.ready:
+            return 0.0
+        return self._keeper.estimator.ahead_s(round(asyncio.get_running_loop().time() * 1e9), clock)
 
     def _handle_starting(self, _: Message) -> None:
         if not self._starting_over:

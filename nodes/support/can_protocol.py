@@ -1,9 +1,12 @@
 """The fixed CAN ids of the protocol, one of the kernel's, and the commands of the admin frames."""
 
+from struct import Struct
 from typing import Final
 
 BUS_STOP_ID: Final = 0x010
-"""Frame ``<reason> <node id of the sender>``: every node with this project's firmware shuts down at once."""
+"""Every node with this project's firmware shuts down at once, whatever the frame contains."""
+BUS_STOP: Final = Struct("<BBI")
+"""Its reason, the node id of the sender, and that node's clock; a host sends zeros."""
 TRIGGER_ID: Final = 0x020
 """First of TRIGGER_GROUPS ids: an endstop of that group triggered."""
 TRIGGER_GROUPS: Final = 16

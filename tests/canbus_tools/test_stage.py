@@ -34,5 +34,5 @@ def test_one_is_in_shutdown(six: SixNodes) -> None:
         set_nodeid(host, BED, TOOL_ID + 1)
     assert [stage.is_shut_down(nodeid) for nodeid in (MAIN_ID, TOOL_ID, TOOL_ID + 1)] == [False, True, False]
     with stage.user() as host:
-        host.send(CanFrame(0x010, b"\x00\x00"))  # which Klipper-type boards do not know
+        host.send(CanFrame(0x010, bytes(6)))  # which Klipper-type boards do not know
     assert [stage.is_shut_down(nodeid) for nodeid in (MAIN_ID, TOOL_ID + 1)] == [True, False]

@@ -1,5 +1,7 @@
 """Signals from node to node: emergency stop of the bus, and the pulse that latches all clocks."""
 
+import struct
+
 import pytest
 
 from tests.firmware.host import NODE_ID, Host, NodeOptions
@@ -97,7 +99,7 @@ def test_a_node_that_shuts_down_by_itself_stops_the_others_where_the_host_wants_
     wire.run(10 * LATENCY)
     (signal,) = wire.heard
     assert (signal.at, signal.sender, signal.can_id) == (0, 0, STOP)
-    assert signal.data == bytes([report["static_string_id"], NODE_ID])
+    assert signal.data == struct.pack("<BBI", report["static_string_id"], NODE_ID, report["clock"])
     assert hosts[0].text(report) == "Invalid count parameter"
     assert hosts[0].ask("get_clock")["clock"] == (begin + 10 * LATENCY) % ROLLOVER
     for host in hosts[1:3]:

@@ -316,7 +316,7 @@ def test_a_node_that_shuts_down_while_others_still_start(tmp_path: Path) -> None
         machine.config.write_text(machine.config.read_text() + "[output_pin other]\npin: PF7\n")
         stops_bus = machine.node("stranger").controller
         assert stops_bus is not None
-        machine.at(3.0, lambda: stops_bus.send(BUS_STOP_ID, bytes(2)))
+        machine.at(3.0, lambda: stops_bus.send(BUS_STOP_ID, bytes(6)))
         await run(stage, "RESTART")
         await begun_anew(stage, 2)
         assert any("reset and started again" in line for line in stage.lines), stage.lines

@@ -113,7 +113,7 @@ def every_frame() -> list[Frame]:
         Frame(50.0, 0x3F1, bytes.fromhex("2090a4ae022dfc01")),
         Frame(51.0, 0x3F1, bytes.fromhex("2090a4ae022dfc11")),
         Frame(52.0, 0x3F1, bytes.fromhex("2190a4ae022dfc2a")),
-        Frame(53.0, 0x010, b"\x00\x00"),
+        Frame(53.0, 0x010, bytes(6)),
         Frame(54.0, 0x3F0, b"\x01\x02"),  # too short
         Frame(55.0, 0x3F0, b"\x99"),
         Frame(56.0, 0x3F0, b""),
@@ -144,7 +144,7 @@ def test_admin_and_signal_frames_read_as_our_decoder_reads_them(tmp_path: Path) 
         ("canductor.set_command == 0x11", [12]),
         ('canductor.message == "who_is_here"', [6]),
         ("canductor.extension == 1", [5, 6, 8, 9, 10, 13, 14]),
-        ("canductor.clock == 0x66554433", [10]),
+        ("canductor.clock == 0x66554433", [9, 10]),
         ("canductor.seq == 0x11", [5]),
         ('canductor.kind == "ack"', [22]),
         ('canductor.direction == "to" && canductor.nodeid == 255', [23]),

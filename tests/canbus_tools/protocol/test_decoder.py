@@ -144,7 +144,9 @@ def test_admin_and_signal_frames() -> None:
         .frame(0x3F0, b"\x01" + uuid + b"\x05")
     )
     talk.frame(0x3F0, b"\x41").frame(0x3F1, b"\x21" + uuid + b"\x05").frame(0x3F0, b"\x40\xff")
-    talk.frame(0x010, b"\x03\x00").frame(0x023, b"\x03\x02\x78\x56\x34\x12").frame(0x3F0, b"\x02" + uuid)
+    talk.frame(0x010, b"\x03\x05\x21\x43\x65\x87").frame(0x023, b"\x03\x02\x78\x56\x34\x12").frame(
+        0x3F0, b"\x02" + uuid
+    )
     decoder = BusDecoder()
     said = decode(decoder, talk.frames)
     assert texts(said) == [
@@ -154,12 +156,12 @@ def test_admin_and_signal_frames() -> None:
         "who_is_here",
         "node_is_here uuid=90a4ae022dfc nodeid=5",
         "sync_pulse seq=255",
-        "bus_stop reason=3 origin=host",
+        "bus_stop reason=3 origin=5 clock=2271560481",
         "trigger group=3 reason=2 clock=305419896",
         "request_bootloader uuid=90a4ae022dfc",
     ]
     assert [item.kind for item in said] == [Kind.ADMIN] * 6 + [Kind.SIGNAL] * 2 + [Kind.ADMIN]
-    assert [item.nodeid for item in said] == [None, None, 5, None, 5, None, None, None, None]
+    assert [item.nodeid for item in said] == [None, None, 5, None, 5, None, 5, None, None]
     assert decoder.nodes[5].uuid == "90a4ae022dfc"
 
 

@@ -202,6 +202,7 @@ static void shut_down(uint16_t reason) {
     node.objects.stops_bus = 1;
     node.shutdown.active = 1;
     node.shutdown.reason = reason;
+    node.shutdown.clock = CLOCK - 1;
     bus_signals_shutdown(&node);
 }
 
@@ -211,7 +212,8 @@ static void a_shutdown_stops_the_bus_with_its_reason_and_origin(void) {
         start(1);
         shut_down(reasons[i]);
         CHECK_EQUAL(frame_count, 1);
-        sent(0, STOP, (const uint8_t[]){(uint8_t)(reasons[i] < 256 ? reasons[i] : 0), 77}, 2);
+        uint8_t reason = (uint8_t)(reasons[i] < 256 ? reasons[i] : 0);
+        sent(0, STOP, (const uint8_t[]){reason, 77, 0x31, 0x54, 0x76, 0x98}, 6);
         CHECK_EQUAL(stream.signals.stop_waiting, 0);
         CHECK_EQUAL(bus_signals_flush(&node), 0);
     }
@@ -243,7 +245,7 @@ static void a_stop_that_is_refused_goes_before_triggers(void) {
     accepts = 9;
     CHECK_EQUAL(bus_signals_flush(&node), 0);
     CHECK_EQUAL(frame_count, 2);
-    sent(0, STOP, (const uint8_t[]){3, 77}, 2);
+    sent(0, STOP, (const uint8_t[]){3, 77, 0x31, 0x54, 0x76, 0x98}, 6);
     sent(1, TRIGGER + 4, (const uint8_t[]){4, 6, 0, 0, 0, 0}, 6);
 }
 

@@ -86,6 +86,33 @@ def test_a_clock_that_has_jumped_is_measured_from_where_it_is_now(settled: Node,
         assert abs(settled.error_s) < settled.estimator.estimate().error_s
 
 
+@pytest.mark.parametrize(("moved_s", "jumps"), [(2e-3, 1), (-2e-3, 1), (0.6e-3, 0)])
+def test_a_jump_is_told_from_a_clock_that_begins_again_close_by(
+    settled: Node, moved_s: float, jumps: int
+) -> None:
+    settled.zero_ns -= round(moved_s * 1e9)
+    for _ in range(CONTRADICTIONS - 1):
+        settled.sample(used=False)
+    settled.sample()
+    assert settled.estimator.jumps == jumps
+    assert settled.estimator.jump_s == pytest.approx(moved_s * jumps, abs=TOLERANCE_S)
+
+
+@pytest.mark.parametrize("zero_s", [0.0, 3.0, 25.5])
+def test_what_was_read_before_now_cannot_be_ahead_of_now(settled: Node, zero_s: float) -> None:
+    """Wherever its 32 bits stand: they roll over each 25.6 s."""
+    moved_ns = round(zero_s * 1e9)
+    moved = Node(now_ns=settled.now_ns + moved_ns)
+    moved.follow(START_SAMPLES + 20)
+    now_ns = moved.now_ns + SECOND_NS // 2
+    clock = moved.ticks(now_ns)
+    for late_s in (-5.0, -1e-3, 0.0, 20e-6):
+        assert moved.estimator.ahead_s(now_ns, (clock + round(late_s * FREQ_HZ)) % WHOLE) == 0.0
+    for ahead_s in (1e-3, 0.5, 12.0):
+        found_s = moved.estimator.ahead_s(now_ns, (clock + round(ahead_s * FREQ_HZ)) % WHOLE)
+        assert found_s == pytest.approx(ahead_s, abs=TOLERANCE_S)
+
+
 def test_behind_a_long_silence_the_rate_is_learned_again(settled: Node) -> None:
     known_s = settled.estimator.estimate().error_s
     settled.now_ns += GAP_NS + 2 * SECOND_NS
