@@ -6,11 +6,13 @@ without a jump, each aimed at where the two clock estimators say the node's cloc
 """
 
 from array import array
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-from nodes.clock.clock import HostTime, Ticks
+from nodes.clock.clock import ClockEstimator, HostTime, Ticks
 from nodes.clock.estimated_clock import EstimatedClock
 from nodes.clock.sync_pulse import PulseClock
+from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
 STEER_HORIZON_S = 1.0
@@ -71,6 +73,26 @@ class ClockMap:
         """All pieces, those that have ended first."""
         ended = (ClockPiece(*self._ended[at : at + 3]) for at in range(0, len(self._ended), 3))
         return [*ended, self.last]
+
+
+class JumpWatch:
+    """Looks for jumps of the clocks of NODES: steps that were timed before one are not where they belong."""
+
+    def __init__(self, nodes: Iterable[Node]) -> None:
+        self._nodes = {node.name: node for node in nodes}
+        self._seen: dict[str, tuple[ClockEstimator, int]] = {}
+
+    def look(self, *, moving: bool) -> None:
+        """Raise ClockJumpError when a clock has jumped since the last look, and the machine is MOVING."""
+        for name, node in self._nodes.items():
+            clock = node.clock
+            seen, self._seen[name] = self._seen.get(name), (clock, clock.jumps)
+            if moving and seen is not None and seen[0] is clock and seen[1] != clock.jumps:
+                raise ClockJumpError(
+                    f"the clock of node {name} jumped by {clock.jump_s * 1e3:+.1f} ms during a move; its "
+                    "oscillator or its link is failing, or the host's clock is: check the board's supply and "
+                    "the wiring"
+                )
 
 
 class TimeBase:

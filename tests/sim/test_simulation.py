@@ -33,11 +33,20 @@ def test_a_scenario_holds(entry: scenario.Scenario) -> None:
     [
         ("clock_random", 494, "lost node toolhead: its clock is unusable: 8 readings in a row contradict"),
         ("clock_random", 526, "lost node toolhead: its clock is unusable: 8 readings in a row contradict"),
+        (
+            "clock_primary_jump",
+            3,
+            "Stepper too far in past (its clock was 895.5 ms ahead of what the host knows",
+        ),
+        ("clock_primary_jump", 15, "the clock of node mcu jumped by +3.3 ms during a move"),
+        ("forged_block", 95, "node toolhead shut down: Another host sends to this node"),
         ("cut_long", 981, "lost node toolhead: can0 node 5: lost, no acknowledgement"),
     ],
 )
 def test_what_a_seed_once_found(name: str, seed: int, cause: str) -> None:
-    """An axis followed a clock that lies; a long command of a slow axis was sent too late."""
+    """An axis followed a clock that lies, or late steps were named instead of it; commands of ours were lost
+    where a stranger's had met them; a long command of a slow axis was sent too late.
+    """
     result = play(scenario.find(name), seed)
     assert result.ok, result.to_text()
     assert cause in result.to_text()

@@ -15,6 +15,7 @@ from coordinator.motion.moves import Move
 from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps.steps import StepGenerator
 from coordinator.runtime.machine import Machine, link_of
+from coordinator.runtime.timebase import JumpWatch
 
 START_LEAD_S: Final = 0.4
 """From now to the first step: time to arm what has to stop it, and for the steps to reach the nodes."""
@@ -126,6 +127,8 @@ class SingleMove:
         specs = machine.devices.stepper_specs()
         if ways is not None:
             specs = [_by_itself(spec, ways.get(spec.name, 0.0)) for spec in specs]
+        self._jumps = JumpWatch((machine.primary, *self._nodes))
+        self._jumps.look(moving=False)
         self._steps = StepGenerator(specs, machine.stream_specs())
         self._maps = [machine.clock_map(self._time_base, node, now) for node in self._nodes]
         for index, clock_map in enumerate(self._maps):
@@ -159,6 +162,7 @@ class SingleMove:
 
     def stream(self) -> None:
         """Make and send what is due by now; CanductorError when a node cannot take it."""
+        self._jumps.look(moving=True)
         until = min(self.print_time_now() + SEND_AHEAD_S, self.end_s)
         border = self._steps.generated_until
         for index, (node, clock_map) in enumerate(zip(self._nodes, self._maps, strict=True)):

@@ -1,13 +1,17 @@
 """Print time against exactly known clocks."""
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 
-from coordinator.runtime.timebase import SLEW_LIMIT, ClockJumpError, ClockPiece, TimeBase
+from coordinator.runtime.timebase import SLEW_LIMIT, ClockJumpError, ClockPiece, JumpWatch, TimeBase
 from coordinator.verification.planned import ticks_at
-from nodes.clock.clock import HostTime, Ticks
+from nodes.clock.clock import ClockEstimator, HostTime, Ticks
 from nodes.clock.pulse_fit import PulseFit
 from nodes.clock.sync_pulse import PulseClock
+from nodes.node.node import Node
 
 
 class Clock:
@@ -65,6 +69,21 @@ def test_a_clock_that_jumps_is_refused() -> None:
     seen.ticks0 += SECONDARY_FREQ * 0.02
     with pytest.raises(ClockJumpError, match=r"node toolhead is \+20\.0 ms"):
         time_base.steer("toolhead", clock_map, seen, 101.0)
+
+
+def test_a_jump_counts_if_it_was_during_a_move() -> None:
+    clock = ClockEstimator(168_000_000)
+    node = cast("Node", SimpleNamespace(name="toolhead", clock=clock))
+    watch = JumpWatch([node])
+    watch.look(moving=True)
+    clock.jumps, clock.jump_s = 1, -0.0125
+    watch.look(moving=False)
+    watch.look(moving=True)
+    clock.jumps = 2
+    with pytest.raises(
+        ClockJumpError, match=r"^the clock of node toolhead jumped by -12\.5 ms during a move; "
+    ):
+        watch.look(moving=True)
 
 
 def test_primary_map_is_exact() -> None:
