@@ -207,7 +207,7 @@ ADMIN_FRAMES: Final = (
 )
 """Frames that assign node ids and synchronise clocks; distinguished by their id and first byte."""
 
-_SIGNAL_CLOCK: Final = "clock of the sender when it triggered or shut down; of a host 0"
+_SIGNAL_CLOCK: Final = "clock of the sender when it triggered or shut down; 0 from a host"
 
 SIGNAL_FRAMES: Final = (
     FrameFormat(

@@ -5,6 +5,7 @@ it by a constant factor; those of a secondary node are steered: its map is made 
 without a jump, each aimed at where the two clock estimators say the node's clock will be a moment later.
 """
 
+import math
 from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -76,18 +77,25 @@ class ClockMap:
 
 
 class JumpWatch:
-    """Looks for jumps of the clocks of NODES: steps that were timed before one are not where they belong."""
+    """Looks for jumps of the clocks of NODES during moves; steps sent before a jump are at wrong times."""
 
     def __init__(self, nodes: Iterable[Node]) -> None:
         self._nodes = {node.name: node for node in nodes}
         self._seen: dict[str, tuple[ClockEstimator, int]] = {}
+        self._looked_s = math.inf
 
-    def look(self, *, moving: bool) -> None:
-        """Raise ClockJumpError when a clock has jumped since the last look, and the machine is MOVING."""
+    def look(self, now_s: float, moves_until_s: float) -> None:
+        """Look at NOW_S, with moves generated until MOVES_UNTIL_S (print times).
+
+        Raises ClockJumpError when a clock has jumped since the last look and the machine moved at that time.
+        What time it is after a jump says nothing about that: the primary node's clock may have jumped.
+        """
+        moved = self._looked_s < moves_until_s
+        self._looked_s = now_s
         for name, node in self._nodes.items():
             clock = node.clock
             seen, self._seen[name] = self._seen.get(name), (clock, clock.jumps)
-            if moving and seen is not None and seen[0] is clock and seen[1] != clock.jumps:
+            if moved and seen is not None and seen[0] is clock and seen[1] != clock.jumps:
                 raise ClockJumpError(
                     f"the clock of node {name} jumped by {clock.jump_s * 1e3:+.1f} ms during a move; its "
                     "oscillator or its link is failing, or the host's clock is: check the board's supply and "

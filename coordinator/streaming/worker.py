@@ -84,8 +84,6 @@ class MotionWorker:
         self.maps: list[ClockMap] = [machine.clock_map(self._time_base, node, now_s) for node in self._nodes]
         """Per moving node: print time to ticks, as the steps were timed; without a record only its end."""
         self._jumps = JumpWatch((machine.primary, *self._nodes))
-        self._looked_s = now_s
-        """When it was looked for jumps last, by clocks that may have jumped since."""
         self.start_lead_s = START_LEAD_S
         self.held: str | None = None
         """Why the g-code waits, or None."""
@@ -277,8 +275,7 @@ class MotionWorker:
 
     def _generate(self, now: float) -> None:
         """Make the commands up to SEND_AHEAD_S from now, with every node's clock steered first."""
-        self._jumps.look(moving=self._looked_s < self.pipeline.moved_until + self.steps.lag_s)
-        self._looked_s = now
+        self._jumps.look(now, self.pipeline.moved_until + self.steps.lag_s)
         while True:
             complete = self.pipeline.transfer()
             self._steer()

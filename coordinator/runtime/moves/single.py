@@ -128,7 +128,7 @@ class SingleMove:
         if ways is not None:
             specs = [_by_itself(spec, ways.get(spec.name, 0.0)) for spec in specs]
         self._jumps = JumpWatch((machine.primary, *self._nodes))
-        self._jumps.look(moving=False)
+        self._jumps.look(now, self.end_s)
         self._steps = StepGenerator(specs, machine.stream_specs())
         self._maps = [machine.clock_map(self._time_base, node, now) for node in self._nodes]
         for index, clock_map in enumerate(self._maps):
@@ -162,8 +162,9 @@ class SingleMove:
 
     def stream(self) -> None:
         """Make and send what is due by now; CanductorError when a node cannot take it."""
-        self._jumps.look(moving=True)
-        until = min(self.print_time_now() + SEND_AHEAD_S, self.end_s)
+        now = self.print_time_now()
+        self._jumps.look(now, self.end_s)
+        until = min(now + SEND_AHEAD_S, self.end_s)
         border = self._steps.generated_until
         for index, (node, clock_map) in enumerate(zip(self._nodes, self._maps, strict=True)):
             if node is not self._machine.primary and border > clock_map.last.print_time:

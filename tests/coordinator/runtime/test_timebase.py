@@ -71,19 +71,30 @@ def test_a_clock_that_jumps_is_refused() -> None:
         time_base.steer("toolhead", clock_map, seen, 101.0)
 
 
-def test_a_jump_counts_if_it_was_during_a_move() -> None:
+def test_a_jump_counts_if_the_machine_moved_before_it() -> None:
     clock = ClockEstimator(168_000_000)
     node = cast("Node", SimpleNamespace(name="toolhead", clock=clock))
     watch = JumpWatch([node])
-    watch.look(moving=True)
-    clock.jumps, clock.jump_s = 1, -0.0125
-    watch.look(moving=False)
-    watch.look(moving=True)
-    clock.jumps = 2
+    watch.look(10.0, 10.5)
+    watch.look(10.6, 10.5)
+    clock.jumps = 1  # at rest: the host was suspended
+    watch.look(11.0, 10.5)
+    watch.look(11.5, 12.0)
+    clock.jumps, clock.jump_s = 2, 0.8
     with pytest.raises(
-        ClockJumpError, match=r"^the clock of node toolhead jumped by -12\.5 ms during a move; "
+        ClockJumpError, match=r"^the clock of node toolhead jumped by \+800\.0 ms during a move; "
     ):
-        watch.look(moving=True)
+        watch.look(12.3, 12.0)
+
+
+def test_a_node_that_was_connected_again_has_another_clock_and_not_jumped() -> None:
+    old, new = ClockEstimator(168_000_000), ClockEstimator(168_000_000)
+    old.jumps = 1
+    node = SimpleNamespace(name="toolhead", clock=old)
+    watch = JumpWatch([cast("Node", node)])
+    watch.look(10.0, 20.0)
+    node.clock = new
+    watch.look(11.0, 20.0)
 
 
 def test_primary_map_is_exact() -> None:

@@ -1,6 +1,7 @@
 """Nodes that restart by themselves, sleep, are doubled, or may be absent."""
 
 import asyncio
+import re
 
 import pytest
 
@@ -156,6 +157,21 @@ def test_a_node_whose_id_was_given_away_says_what_to_do() -> None:
         await machine.changed_to(NodeState.SHUTDOWN)
         assert "Another CAN node assigned this ID: another board was given its node id" in str(
             machine.node.failure
+        )
+
+    machine.run(machine.bus.start, check)
+
+
+@pytest.mark.parametrize(("ahead_s", "named"), [(0.5, True), (-0.5, False)])
+def test_a_node_that_shuts_down_with_a_clock_that_is_ahead_says_so(ahead_s: float, named: bool) -> None:
+    machine = Machine(TwinNode())
+
+    async def check() -> None:
+        now_s = asyncio.get_running_loop().time()
+        machine.io.links[0].say(machine.twin.shutdown(now_s + ahead_s, 1))
+        await machine.changed_to(NodeState.SHUTDOWN)
+        assert (
+            bool(re.search(r"\(its clock was (499|500)\.\d ms ahead of ", str(machine.node.failure))) is named
         )
 
     machine.run(machine.bus.start, check)
