@@ -203,7 +203,9 @@ class EndstopPhase(Module):
                 f" {wanted}/{phases} was expected: that is more than endstop_accuracy; check the switch, or"
                 " ENDSTOP_PHASE_CALIBRATE again"
             )
-        return sense * (off + self._off_zero(wanted, sense)) * forward * stepper.step_distance
+        # The trigger counts as being at a step: its time tells a part of one, which does not repeat as well.
+        part_mm = made.distance_mm - made.steps * stepper.step_distance
+        return sense * (off + self._off_zero(wanted, sense)) * forward * stepper.step_distance - part_mm
 
     def _off_zero(self, wanted: int, sense: int) -> float:
         """Return by how many phases the 0 of the axis is beyond the nearest full step, if that counts."""
