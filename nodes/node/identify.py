@@ -18,9 +18,9 @@ from nodes.node.errors import NodeLost
 from nodes.node.request_reply import QueryTimeout, RequestReply
 
 IDENTIFY_PIECE: Final = 40
-PIECE_TRIES: Final = 16
-"""A piece takes seven frames and a dictionary about sixty pieces: where one frame in twenty is lost, one
-start in twenty would fail with the tries of other queries. The link detects a silent node sooner."""
+PIECE_TRIES: Final = 32
+"""A piece takes seven frames and a dictionary about sixty pieces: where one frame in ten is lost, one start
+in fifteen would fail with the tries of other queries. The link detects a silent node sooner."""
 MAX_CANDIDATES: Final = 4
 """Dictionaries with the same beginning that are compared, at two queries each, before downloading."""
 
