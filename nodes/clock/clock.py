@@ -167,12 +167,16 @@ class ClockEstimator:
         ahead_s = (ticks - last.ticks_at(HostTime(now_ns))) / self._freq_hz
         return ahead_s if ahead_s > last.asymmetry_s + self._error_s(last, now_ns) else 0.0
 
+    @property
+    def in_doubt(self) -> bool:
+        """Return whether more samples are needed soon."""
+        return self._contradictions > 0 or self.accepted < SETTLE_SAMPLES
+
     def next_sample_ns(self, now_ns: int) -> int:
         """Return when to query the node again after a query at NOW_NS."""
         if self.accepted < BURST_SAMPLES:
             return now_ns + BURST_INTERVAL_NS
-        in_doubt = self._contradictions or self.accepted < SETTLE_SAMPLES
-        return now_ns + (SETTLE_INTERVAL_NS if in_doubt else SAMPLE_INTERVAL_NS)
+        return now_ns + (SETTLE_INTERVAL_NS if self.in_doubt else SAMPLE_INTERVAL_NS)
 
     # ------------------------------------------------------------------------------------------------- fit
 

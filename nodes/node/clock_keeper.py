@@ -1,16 +1,20 @@
 """Regular queries of one node's clock, and a check for a restart when the node goes silent."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Final
 
 from nodes.clock.clock import BROKEN, ClockEstimate, ClockEstimator
 from nodes.clock.wire_time import narrow
 from nodes.node.connector import ClockConnector
-from nodes.node.request_reply import Answer, QueryTimeout, RequestReply
+from nodes.node.request_reply import Answer, Query, QueryTimeout, RequestReply
 from nodes.support.awake import sleep_between
 from nodes.support.errors import CanductorError
 
+CLOCK: Final = Query("get_clock", "clock")
+UPTIME: Final = Query("get_uptime", "uptime")
+REST_INTERVAL_S: Final = 2.0
+"""At least, between two samples of a clock that is known while nothing needs it."""
 SLACK: Final = 0.1
 """By how much of the time between two samples the next may be later."""
 
@@ -23,8 +27,9 @@ _BROKEN: Final = (
 class ClockKeeper:
     """Keeps the clock of the node that TALK talks with, reached through CONNECTOR, until ``close``.
 
-    ON_ESTIMATE gets every new estimate; ON_SAMPLE is awaited after every sample and may raise whatever
-    RequestReply.ask raises; ON_LOST gets a sentence when the clock is no longer kept.
+    ON_ESTIMATE gets every new estimate; ON_LOST gets a sentence when the clock is no longer kept. QUERIES
+    returns what else the node is to be asked at a sample, UPTIME first, or nothing; ON_ANSWERS is awaited
+    with the answers, None for one that is missing, and may raise whatever RequestReply.ask raises.
     """
 
     def __init__(
@@ -33,16 +38,20 @@ class ClockKeeper:
         connector: ClockConnector,
         *,
         on_estimate: Callable[[ClockEstimate], None],
-        on_sample: Callable[[], Awaitable[None]],
+        queries: Callable[[], Sequence[Query]],
+        on_answers: Callable[[Sequence[Answer | None]], Awaitable[None]],
         on_lost: Callable[[str], None],
     ) -> None:
         self.estimator = ClockEstimator(talk.dictionary.clock_freq_hz)
         self.ready = asyncio.Event()
         """Set when the clock is known, or when waiting for it has become pointless."""
+        self.rests = False
+        """Whether nothing needs the clock now."""
         self._talk = talk
         self._connector = connector
         self._on_estimate = on_estimate
-        self._on_sample = on_sample
+        self._queries = queries
+        self._on_answers = on_answers
         self._on_lost = on_lost
         talk.link.on_silent = connector.suspect
         self._task = asyncio.get_running_loop().create_task(self._keep())
@@ -62,20 +71,50 @@ class ClockKeeper:
             task.get_loop().call_exception_handler({"message": "keeping a clock failed", "exception": bug})
 
     async def _keep(self) -> None:
+        loop = asyncio.get_running_loop()
         while True:
+            asked_s = loop.time()
             try:
-                self._sampled(await self._ask())
+                await self._sample()
                 if self.estimator.broken:
                     self._on_lost(_BROKEN)
                     return
-                await self._on_sample()
             except QueryTimeout:
                 self._connector.suspect()  # the link decides when a silent node is lost
             except CanductorError as error:
                 self._on_lost(str(error))
                 return
-            pause_s = self.estimator.next_sample_ns(0) * 1e-9
-            await sleep_between(pause_s, pause_s * (1 + SLACK))
+            interval_s = self.estimator.next_sample_ns(0) * 1e-9
+            if self.rests and not self.estimator.in_doubt:
+                interval_s = max(interval_s, REST_INTERVAL_S)
+            pause_s = max(0.0, asked_s + interval_s - loop.time())  # the answer may have waited
+            await sleep_between(pause_s, pause_s + interval_s * SLACK)
+
+    async def _sample(self) -> None:
+        """Query the clock and what else is asked.
+
+        A computer and a bus that are otherwise at rest wake up once when the answers come together, and the
+        uptime is a reading of the clock. But where the bit rate is not known, the length of the blocks adds
+        to the error of the clock: there it is queried alone.
+        """
+        queries = self._queries()
+        if not queries or self.estimator.in_doubt or not self._is_wire_known():
+            self._sampled(await self._ask())
+            if self.estimator.broken or not queries:
+                return
+            answers = await self._talk.ask_together(queries)
+        else:
+            answers = await self._talk.ask_together(queries)
+            if answers[0] is not None:
+                self._sampled(answers[0])
+        if not self.estimator.broken:
+            await self._on_answers(answers)
+
+    def _is_wire_known(self) -> bool:
+        return self._connector.wire_ns(0, self._bitrate(), answer=False) > 0
+
+    def _bitrate(self) -> int:
+        return self._talk.dictionary.int_constant("CANBUS_FREQUENCY", 0)
 
     def _sampled(self, answer: Answer) -> None:
         if not self._take(answer):
@@ -87,19 +126,19 @@ class ClockKeeper:
             self.ready.set()
 
     async def _ask(self) -> Answer:
-        if self.estimator.accepted:
-            return await self._talk.ask("get_clock", "clock", tries=1, survives_shutdown=True, patient=True)
-        return await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
+        query = CLOCK if self.estimator.accepted else UPTIME
+        patient = not self.estimator.in_doubt
+        return await self._talk.ask(*query, tries=1, survives_shutdown=True, patient=patient)
 
     def _take(self, answer: Answer) -> bool:
         message = answer.message
-        bitrate = self._talk.dictionary.int_constant("CANBUS_FREQUENCY", 0)
+        bitrate = self._bitrate()
         sent_ns, received_ns = narrow(
             answer.sent_ns,
             answer.received_ns,
             self._connector.wire_ns(answer.asked_bytes, bitrate, answer=False),
             self._connector.wire_ns(answer.answered_bytes, bitrate, answer=True),
         )
-        if message.name == "clock":
+        if self.estimator.accepted:
             return self.estimator.add(sent_ns, received_ns, message.integer("clock"))
         return self.estimator.begin(sent_ns, received_ns, message.integer("high"), message.integer("clock"))

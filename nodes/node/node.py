@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 from nodes.clock.clock import ClockEstimate, ClockEstimator
@@ -24,9 +24,16 @@ from nodes.node.errors import NodeError, NodeLost, NodeShutdown, shutdown_senten
 from nodes.node.identify import identify
 from nodes.node.load import NodeLoad, load_of
 from nodes.node.queue_slots import share_slots
-from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, QueryTimeout, RequestReply
+from nodes.node.request_reply import (
+    QUERY_TIMEOUT_S,
+    QUERY_TRIES,
+    Answer,
+    Callback,
+    QueryTimeout,
+    RequestReply,
+)
 from nodes.node.states import NodeEvent, NodeState, following
-from nodes.node.watchdog import NodeWatchdog, get_config, restarted
+from nodes.node.watchdog import QUERIES, NodeWatchdog, get_config, restarted
 from nodes.support.errors import CanductorError
 
 CONFIG_RESET_TRIES: Final = 4
@@ -37,13 +44,11 @@ ALIVE_TIMEOUT_S: Final = 0.1
 CLOCK_TIMEOUT_S: Final = 15.0
 """On a bus that loses one frame in twenty, every fourth sample is lost or unusable."""
 MEASURED: Final = "analog_in_state"
-STATE: Final = ("config", "uptime")
+STATE: Final = ("config", "uptime", "clock", "sync_pulse")
 PATIENCE_S: Final = {
-    "clock": 0.1,
-    "sync_pulse": 0.1,
     **dict.fromkeys(STATE, 0.1),
     "stats": 1.0,
-    MEASURED: 0.005,  # the sensors of a node report together; a heater is controlled by what they say
+    MEASURED: 0.1,  # a third of the time between two; no heater is so quick
 }
 """How long responses that come all the time may wait until something else wakes the host."""
 REST_PATIENCE_S: Final = 1.0
@@ -105,7 +110,7 @@ class Node:
         self._cache = cache
         self._talk = RequestReply(name)
         self._keeper: ClockKeeper | None = None
-        self._watchdog = NodeWatchdog(self._talk, 0)
+        self._watchdog = NodeWatchdog(name, 0)
         self._explain: list[ExplainShutdown] = []
         self._starting_over = True  # messages count only once an old configuration was checked
         self._reaching = False  # a link that is lost now is one attempt that failed
@@ -211,10 +216,15 @@ class Node:
         return self._talk.on(response, oid, callback)
 
     def let_reports_wait(self, *, measurements: bool, state: bool) -> None:
-        """Let what sensors measure and what the node says of its STATE wait for long from now on, or not."""
+        """Let what sensors measure and what the node says of its STATE wait for long from now on, or not.
+
+        A node whose state may wait is at rest: it is asked for it less often, too.
+        """
         with contextlib.suppress(CanductorError):  # there is no link, or it is lost
             for response, rests in {MEASURED: measurements, **dict.fromkeys(STATE, state)}.items():
                 self._talk.let_wait(response, REST_PATIENCE_S if rests else PATIENCE_S[response])
+        if self._keeper is not None:
+            self._keeper.rests = state
 
     def explain_shutdown(self, explain: ExplainShutdown) -> None:
         """Have EXPLAIN add to the sentence of a shutdown, until the node is started again."""
@@ -424,7 +434,7 @@ class Node:
         self._check_configured(found, wanted)
         self.move_count = found.integer("move_count")
         self.step_slots, self.output_slots = share_slots(self.move_count, wanted.timed_outputs)
-        self._watchdog = NodeWatchdog(self._talk, wanted.crc)
+        self._watchdog = NodeWatchdog(self.name, wanted.crc)
         for command in wanted.init_commands:
             self._talk.send_text(command)
 
@@ -502,14 +512,15 @@ class Node:
             self._talk,
             self._connector,
             on_estimate=lambda estimate: self._on_clock(self, estimate),
-            on_sample=self._look,
+            queries=lambda: QUERIES if self.state is NodeState.READY else (),
+            on_answers=self._look,
             on_lost=self.lose,
         )
         return self._keeper
 
-    async def _look(self) -> None:
+    async def _look(self, answers: Sequence[Answer | None]) -> None:
         """Detect a restart or shutdown whose only message was lost."""
-        trouble = await self._watchdog.look() if self.state is NodeState.READY else None
+        trouble = await self._watchdog.look(answers) if self.state is NodeState.READY else None
         if trouble is not None:
             shutdown = isinstance(trouble, NodeShutdown)
             self._fail(NodeEvent.SHUTDOWN if shutdown else NodeEvent.RESTARTED, trouble)

@@ -7,7 +7,7 @@ import asyncio
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
 from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value
@@ -24,6 +24,13 @@ MAX_WAITERS: Final = 256
 
 class QueryTimeout(CanductorError):  # noqa: N818
     """A node did not answer a query, however often it was asked."""
+
+
+class Query(NamedTuple):
+    """A command without arguments and the response to it."""
+
+    command: str
+    response: str
 
 
 @dataclass(frozen=True, slots=True)

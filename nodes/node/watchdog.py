@@ -1,14 +1,23 @@
 """Detection of a node that restarted or shut down although its one message about that was lost."""
 
 import asyncio
+from collections.abc import Sequence
 from typing import Final
 
 from nodes.dictionary.message_format import Message
+from nodes.node.clock_keeper import UPTIME
 from nodes.node.errors import NodeError, NodeRestarted, NodeShutdown, shutdown_sentence
-from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, QueryTimeout, RequestReply
+from nodes.node.request_reply import (
+    QUERY_TIMEOUT_S,
+    QUERY_TRIES,
+    Answer,
+    Query,
+    QueryTimeout,
+    RequestReply,
+)
 
-CONFIG: Final = ("get_config", "config")
-UPTIME: Final = ("get_uptime", "uptime")
+QUERIES: Final = (UPTIME, Query("get_config", "config"))
+"""What shows a restart or a shutdown."""
 SHUTDOWN_GRACE_S: Final = 0.05
 """Time given to a node that is found shut down to report the reason."""
 
@@ -24,25 +33,21 @@ async def get_config(talk: RequestReply, tries: int = QUERY_TRIES) -> Message:
 
 
 class NodeWatchdog:
-    """Watches the node that TALK reaches, from the time it took the configuration with CRC."""
+    """Watches node NAME from the time it took the configuration with CRC."""
 
-    def __init__(self, talk: RequestReply, crc: int) -> None:
-        self._talk = talk
+    def __init__(self, name: str, crc: int) -> None:
+        self._name = name
         self._crc = crc
         self._uptime_ticks = 0
 
-    async def look(self) -> NodeError | None:
-        """Return the failure of the node, or None. Raises QueryTimeout and what RequestReply.ask raises.
-
-        Both questions go in one block: a computer and a bus that are otherwise at rest wake up once. They are
-        apart from the question for the clock, as the length of that block adds to the error of the clock on a
-        serial line, whose bit rate is not known.
+    async def look(self, answers: Sequence[Answer | None]) -> NodeError | None:
+        """Return the failure that the ANSWERS to QUERIES show, or None; QueryTimeout when one is missing.
 
         After a restart the configuration is gone and the uptime has run backwards. The uptime shows a restart
         even when another host has meanwhile configured the node identically.
         """
-        name = self._talk.name
-        config, uptime = await self._talk.ask_together((CONFIG, UPTIME))
+        name = self._name
+        uptime, config = answers
         if config is None:
             raise QueryTimeout(f"node {name} did not answer get_config within {QUERY_TIMEOUT_S:g} s")
         found = config.message

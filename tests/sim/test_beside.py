@@ -166,7 +166,7 @@ def test_a_job_that_waits_for_heat_takes_another_target(tmp_path: Path) -> None:
         await stage.until(lambda: printer.status("extruder")["target"] == 250, "the job's target")
         await gcode(stage, "M104 S60")
         await stage.until(lambda: printer.status("heater_bed")["target"] == 100, "the end of M109")
-        assert float(str(printer.status("extruder")["temperature"])) < 100
+        assert float(str(printer.status("extruder")["temperature"])) < 120
         await gcode(stage, "M140 S0")
         await stage.until_job("done")
         assert printer.status("extruder")["target"] == 60

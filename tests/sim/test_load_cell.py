@@ -141,6 +141,8 @@ def test_a_mesh_finds_the_shape_of_the_bed(tmp_path: Path) -> None:
 # ----------------------------------------------------------------------------------------------- what fails
 
 HOMING = "Z was not homed: "
+GARBLED = "the sensor (lost count of its clock: check the wires of dout_pin and sclk_pin|makes no readings)"
+"""A chip that misses a pulse shows the last bit of its reading: 1 looks like a chip that is not ready."""
 
 
 @pytest.mark.parametrize(
@@ -149,7 +151,7 @@ HOMING = "Z was not homed: "
         (PlantFault.DEAD, "the sensor makes no readings: check its supply and its wiring"),
         (PlantFault.OPEN, "the sensor makes no readings: check its supply and its wiring"),
         (PlantFault.SHORTED, "the force left its safe range: check that nothing presses against the nozzle"),
-        (PlantFault.GARBLED, "the sensor lost count of its clock: check the wires of dout_pin and sclk_pin"),
+        (PlantFault.GARBLED, GARBLED),
         (PlantFault.NEVER, "the probe did not trigger within"),
     ],
 )
@@ -158,7 +160,7 @@ def test_a_sensor_that_fails_on_the_way_down_stops_it_at_once(
 ) -> None:
     stage = stage_with(tmp_path)
     stage.when(lambda: stage.true_mm("z") < 2, lambda: fault(stage, what))
-    with pytest.raises(GCodeError, match=re.escape(why)):
+    with pytest.raises(GCodeError, match=why):
         stage.do("G28")
     if what is not PlantFault.NEVER:
         assert stage.true_mm("z") - bed_height(SHAPE, 0, 0) > 0.5, "not into the bed"
@@ -179,15 +181,18 @@ def test_a_sensor_that_failed_before_is_not_relied_upon(tmp_path: Path, what: Pl
         ({"reference_tare_counts": None}, "it is not calibrated"),
         (
             {"reference_tare_counts": ZERO + 201_000},
-            "the force at rest is -2010 g",
+            r"the force at rest is -20(09|10|11) g",
         ),
-        ({"reference_tare_counts": ZERO - 30_000, "force_safety_limit": 250}, "the force at rest is 300 g"),
+        (
+            {"reference_tare_counts": ZERO - 30_000, "force_safety_limit": 250},
+            "the force at rest is (299|300|301) g",
+        ),
         ({"pullback_distance": 0.02}, "the nozzle did not leave the bed"),
     ],
 )
 def test_what_cannot_be_measured_is_said(tmp_path: Path, options: Mapping[str, Any], why: str) -> None:
     stage = stage_with(tmp_path, **options)
-    with pytest.raises(GCodeError, match=re.escape(why)):
+    with pytest.raises(GCodeError, match=why):
         stage.do("G28")
 
 

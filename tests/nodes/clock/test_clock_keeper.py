@@ -1,7 +1,7 @@
 """Keeping the clock of one node: when it is asked, when it is suspected, and how keeping it ends."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 import pytest
@@ -9,7 +9,8 @@ import pytest
 from nodes.clock.clock import SETTLE_SAMPLES, ClockEstimate
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.errors import NodeLost, NodeShutdown
-from nodes.node.request_reply import RequestReply
+from nodes.node.request_reply import Answer, Query, RequestReply
+from nodes.node.watchdog import QUERIES
 from tests.nodes import virtual_time
 from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode
 
@@ -35,7 +36,9 @@ class Bench:
         self.suspected_s: list[float] = []
         self.lost: list[str] = []
         self.blocks: list[tuple[int, int, bool]] = []
-        self.on_sample: Callable[[], None] = lambda: None
+        self.queries: tuple[Query, ...] = ()
+        self.on_answers: Callable[[], None] = lambda: None
+        self.answered: list[list[str | None]] = []
 
     # What a connector does:
 
@@ -48,9 +51,13 @@ class Bench:
 
     # ------------------------------------------------------------------------------------------------------
 
-    async def _sampled(self) -> None:
+    def _estimated(self, estimate: ClockEstimate) -> None:
         self.sampled_s.append(asyncio.get_running_loop().time())
-        self.on_sample()
+        self.estimates.append(estimate)
+
+    async def _answered(self, answers: Sequence[Answer | None]) -> None:
+        self.answered.append([answer.message.name if answer else None for answer in answers])
+        self.on_answers()
 
     def run(self, main: Callable[[ClockKeeper], Awaitable[None]]) -> list[dict[str, Any]]:
         """Run MAIN beside a keeper, then close it; return what the loop was told of bugs."""
@@ -61,8 +68,9 @@ class Bench:
             keeper = ClockKeeper(
                 self.talk,
                 self,
-                on_estimate=self.estimates.append,
-                on_sample=self._sampled,
+                on_estimate=self._estimated,
+                queries=lambda: self.queries,
+                on_answers=self._answered,
                 on_lost=self.lost.append,
             )
             await main(keeper)
@@ -96,10 +104,65 @@ def test_a_clock_is_learned_by_asking_often_and_kept_by_asking_now_and_then() ->
     assert bench.asked == ["get_uptime"] + ["get_clock"] * 49
     steps_s = [b - a for a, b in zip(bench.sampled_s[:-1], bench.sampled_s[1:], strict=True)]
     intervals_s = [0.025] * 15 + [0.05] * 32 + [0.9843] * 2
-    assert [step_s - 2 * DELAY_S for step_s in steps_s] == pytest.approx(intervals_s, abs=1e-10)
+    assert steps_s == pytest.approx(intervals_s, abs=1e-10)
     assert bench.link.clocks == [(e.freq_hz, e.at_ns, e.at_ticks) for e in bench.estimates]
     assert bench.lost == []
     assert bench.suspected_s == []
+
+
+def test_what_else_is_asked_goes_along_where_that_makes_no_difference_to_the_clock() -> None:
+    bench = Bench(**{BITRATE: 250_000})
+
+    async def learn(keeper: ClockKeeper) -> None:
+        await keeper.ready.wait()
+        bench.queries = QUERIES
+        await asyncio.sleep(2.5)
+
+    assert bench.run(learn) == []
+    learned = ["get_uptime"] + ["get_clock"] * (SETTLE_SAMPLES - 1)
+    assert bench.asked == learned + ["get_uptime", "get_config"] * 2
+    assert bench.answered == [["uptime", "config"]] * 2
+    assert len(bench.link.sent) == SETTLE_SAMPLES + 2, "a block each"
+    assert len(bench.estimates) == SETTLE_SAMPLES + 2, "the uptime is a reading of the clock"
+
+
+def test_what_else_is_asked_comes_behind_a_clock_in_doubt() -> None:
+    bench = Bench(**{BITRATE: 250_000})
+    bench.queries = QUERIES
+    assert bench.run(sleeping(0.04)) == []
+    assert bench.asked == ["get_uptime", "get_uptime", "get_config", "get_clock", "get_uptime", "get_config"]
+    assert bench.answered == [["uptime", "config"]] * 2
+
+
+def test_what_else_is_asked_comes_behind_the_clock_on_a_line_of_unknown_bit_rate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench = Bench()
+    monkeypatch.setattr(bench, "wire_ns", lambda *_, **__: 0)
+
+    async def learn(keeper: ClockKeeper) -> None:
+        await keeper.ready.wait()
+        bench.queries = QUERIES
+        bench.twin.executed.clear()
+        await asyncio.sleep(1.0)
+
+    assert bench.run(learn) == []
+    assert bench.asked == ["get_clock", "get_uptime", "get_config"]
+    assert bench.answered == [["uptime", "config"]]
+
+
+def test_an_answer_that_is_missing_is_no_reading() -> None:
+    bench = Bench(**{BITRATE: 250_000})
+
+    async def learn(keeper: ClockKeeper) -> None:
+        await keeper.ready.wait()
+        bench.queries = (*QUERIES[:1], Query("get_config", "uptime"))
+        bench.twin.executed.clear()
+        await asyncio.sleep(1.5)
+
+    assert bench.run(learn) == []
+    assert bench.answered == [["uptime", None]]
+    assert len(bench.estimates) == SETTLE_SAMPLES + 1
 
 
 def test_the_time_on_the_wire_is_taken_off_the_exchange() -> None:
@@ -127,7 +190,7 @@ def test_a_node_that_does_not_answer_is_suspected_and_asked_again() -> None:
     bench.twin.alive = False
     bench.run(sleeping(0.85))
     times_s = [t - virtual_time.START_S for t in bench.suspected_s]
-    assert times_s == pytest.approx([0.25, 0.525, 0.8], abs=1e-6)
+    assert times_s == pytest.approx([0.25, 0.5, 0.75], abs=1e-6)
     assert bench.estimates == []
     assert bench.lost == []
 
@@ -137,6 +200,7 @@ def test_an_answer_of_unknown_times_is_not_used() -> None:
 
     async def main(keeper: ClockKeeper) -> None:
         await asyncio.sleep(0.01)
+        bench.queries = QUERIES
         known = len(bench.estimates)
         bench.twin.alive = False
         await asyncio.sleep(0.02)
@@ -144,7 +208,8 @@ def test_an_answer_of_unknown_times_is_not_used() -> None:
         await asyncio.sleep(0.01)
         assert keeper.estimator.unusable == 1
         assert len(bench.estimates) == known == len(bench.link.clocks)
-        assert len(bench.sampled_s) == known + 1, "it is a sign of life nevertheless"
+        assert bench.suspected_s == [], "it is a sign of life nevertheless"
+        assert len(bench.link.sent) == known + 2, "and what else is asked follows"
 
     bench.run(main)
 
@@ -199,7 +264,7 @@ def test_a_bug_is_reported_and_the_node_given_up() -> None:
     def fail() -> None:
         raise bug
 
-    bench.on_sample = fail
+    bench.queries, bench.on_answers = QUERIES, fail
     bugs = bench.run(sleeping(1.0))
     assert [context["exception"] for context in bugs] == [bug]
     assert [text.split(";")[0] for text in bench.lost] == ["its clock is no longer kept"]
