@@ -93,6 +93,13 @@ class _Reading(NamedTuple):
     round_trip_s: float
 
 
+def _is_one_clock(first: _Reading, second: _Reading, freq_hz: float) -> bool:
+    """Whether a clock of some FREQ_HZ can have been read as FIRST, and later as SECOND."""
+    passed_s = (second.at_ns - first.at_ns) * 1e-9
+    off_s = abs((second.ticks - first.ticks) / freq_hz - passed_s)
+    return off_s <= (first.round_trip_s + second.round_trip_s) / 2 + RATE_SD * passed_s
+
+
 class ClockEstimator:
     """Estimates one node's clock. NOMINAL_FREQ_HZ > 0 comes from its dictionary.
 
@@ -108,6 +115,8 @@ class ClockEstimator:
         self._zero_ticks: int
         self._start: Start
         self._filter: Blend | None
+        self._used: _Reading
+        """The last one, set by the first sample."""
         self._impossible: deque[_Reading] = deque(maxlen=CONTRADICTIONS)
         """The last ones, since the last possible one."""
         self._contradictions = 0
@@ -187,17 +196,21 @@ class ClockEstimator:
             self.unusable += 1
             return False
         round_trip_s = (received_ns - sent_ns) * 1e-9
+        reading = _Reading(middle_ns, ticks, round_trip_s)
         if last is None or middle_ns - last.at_ns > GAP_NS:
             self._restart(middle_ns, ticks)
-        elif self._is_impossible(last, middle_ns, ticks, round_trip_s):
+        elif self._is_impossible(last, reading):
             self._contradictions += 1
-            self._impossible.append(_Reading(middle_ns, ticks, round_trip_s))
-            if not self._has_jumped(last.freq_hz):
+            self._impossible.append(reading)
+            if not self._agree(last.freq_hz):
                 self.unusable += 1
                 return False
-            self._note_jump((ticks - last.ticks_at(middle_ns)) / self._freq_hz)
+            # On a busy bus the answers may only show by how much the estimate was off, within their times.
+            if not _is_one_clock(self._used, reading, last.freq_hz):
+                self._note_jump((ticks - last.ticks_at(middle_ns)) / self._freq_hz)
             self._restart(middle_ns, ticks)
         self._forget_contradictions()
+        self._used = reading
         self._round_trips_s.append(round_trip_s)
         self.accepted += 1
         self._fit(middle_ns, ticks, round_trip_s)
@@ -209,27 +222,22 @@ class ClockEstimator:
         self._start, self._filter = Start(), None
         self._round_trips_s.clear()
 
-    def _is_impossible(
-        self, last: ClockEstimate, middle_ns: HostTime, ticks: Ticks, round_trip_s: float
-    ) -> bool:
-        """Whether this reading cannot lie between query and answer."""
-        off_s = abs(ticks - last.ticks_at(middle_ns)) / self._freq_hz
-        return off_s > round_trip_s / 2 + self._error_s(last, middle_ns)
+    def _is_impossible(self, last: ClockEstimate, reading: _Reading) -> bool:
+        """Whether READING cannot lie between query and answer."""
+        off_s = abs(reading.ticks - last.ticks_at(reading.at_ns)) / self._freq_hz
+        return off_s > reading.round_trip_s / 2 + self._error_s(last, reading.at_ns)
 
     @staticmethod
     def _error_s(estimate: ClockEstimate, at_ns: int) -> float:
         """Return the bound of the error at AT_NS, after the estimate."""
         return estimate.error_s * (1 + (at_ns - estimate.at_ns) * 1e-9 / AHEAD_S)
 
-    def _has_jumped(self, freq_hz: float) -> bool:
+    def _agree(self, freq_hz: float) -> bool:
         """Whether CONTRADICTIONS impossible readings are those of one clock."""
         first, *others = self._impossible
-        for other in others:
-            passed_s = (other.at_ns - first.at_ns) * 1e-9
-            off_s = abs((other.ticks - first.ticks) / freq_hz - passed_s)
-            if off_s > (first.round_trip_s + other.round_trip_s) / 2 + RATE_SD * passed_s:
-                return False
-        return len(self._impossible) == CONTRADICTIONS
+        return len(others) == CONTRADICTIONS - 1 and all(
+            _is_one_clock(first, other, freq_hz) for other in others
+        )
 
     def _note_jump(self, jump_s: float) -> None:
         if abs(jump_s) >= JUMP_S:

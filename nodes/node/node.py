@@ -48,7 +48,7 @@ STATE: Final = ("config", "uptime", "clock", "sync_pulse")
 PATIENCE_S: Final = {
     **dict.fromkeys(STATE, 0.1),
     "stats": 1.0,
-    MEASURED: 0.1,  # a third of the time between two; no heater is so quick
+    MEASURED: 0.005,  # the sensors of a node report together; a heater is controlled by what they say
 }
 """How long responses that come all the time may wait until something else wakes the host."""
 REST_PATIENCE_S: Final = 1.0

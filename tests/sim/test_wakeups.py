@@ -9,7 +9,7 @@ from coordinator.simulate.stage import Stage
 from coordinator.streaming.streamer import FULL_CYCLE_S, REST_CYCLE_S
 from coordinator.streaming.worker import SEND_AHEAD_S
 from nodes.devices.analog_in import REPORT_S
-from nodes.node.node import MEASURED, PATIENCE_S, REST_PATIENCE_S
+from nodes.node.node import PATIENCE_S, REST_PATIENCE_S
 from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served, running, zigzag
 
@@ -107,7 +107,7 @@ def test_measurements_wait_only_while_nothing_acts_on_them(tmp_path: Path) -> No
         for _ in range(2):
             assert REST_PATIENCE_S / 2 < await oldest_s() < REST_PATIENCE_S + SOON_S
             await gcode(stage, "M140 S60")
-            assert await oldest_s() < PATIENCE_S[MEASURED] + SOON_S
+            assert await oldest_s() < SOON_S
             await gcode(stage, "M140 S0")
 
     printer.serve(go)

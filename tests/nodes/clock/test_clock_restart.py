@@ -29,9 +29,15 @@ class Node:
         """Return its clock in 64 bits."""
         return round((at_ns - self.zero_ns) * 1e-9 * FREQ_HZ * (1 + 50e-6))
 
-    def sample(self, *, wrong_s: float = 0.0, begin: bool = False, used: bool = True) -> None:
-        """Ask once, as often as the estimator asks for it; the answer is wrong by WRONG_S, USED or not."""
+    def sample(
+        self, *, wrong_s: float = 0.0, late_s: float = 0.0, begin: bool = False, used: bool = True
+    ) -> None:
+        """Ask once, as often as the estimator asks for it; the answer is wrong by WRONG_S, USED or not.
+
+        It is LATE_S behind its time.
+        """
         out_ns, back_ns = (150_000 + round(self._random.expovariate(1 / 50_000)) for _ in range(2))
+        back_ns += round(late_s * SECOND_NS)
         clock = self.ticks(self.now_ns + out_ns) + round(wrong_s * FREQ_HZ)
         received_ns = self.now_ns + out_ns + back_ns
         if begin:
@@ -96,6 +102,20 @@ def test_a_jump_is_told_from_a_clock_that_begins_again_close_by(
     settled.sample()
     assert settled.estimator.jumps == jumps
     assert settled.estimator.jump_s == pytest.approx(moved_s * jumps, abs=TOLERANCE_S)
+
+
+def test_an_estimate_that_was_off_within_the_time_of_its_answers_is_no_jump() -> None:
+    """As on a bus that others fill: all answers come 6 ms late, until the bus is free again."""
+    node = Node()
+    node.sample(late_s=6e-3, begin=True)
+    for _ in range(START_SAMPLES + 20):
+        node.sample(late_s=6e-3)
+    assert node.error_s < -2e-3
+    for _ in range(CONTRADICTIONS - 1):
+        node.sample(used=False)
+    node.sample()
+    assert abs(node.error_s) < 2 * TOLERANCE_S
+    assert node.estimator.jumps == 0
 
 
 @pytest.mark.parametrize("zero_s", [0.0, 3.0, 25.5])
