@@ -103,7 +103,7 @@ def _is_one_clock(first: _Reading, second: _Reading, freq_hz: float) -> bool:
 class ClockEstimator:
     """Estimates one node's clock. NOMINAL_FREQ_HZ > 0 comes from its dictionary.
 
-    ``begin`` with the answer to get_uptime, then ``add`` for every answer to get_clock.
+    ``begin`` with the answer to get_uptime, then ``add`` for every answer to get_clock or get_uptime.
     """
 
     def __init__(self, nominal_freq_hz: int) -> None:
@@ -151,7 +151,7 @@ class ClockEstimator:
         return self._take(sent_ns, received_ns, Ticks(high * _WHOLE + clock32 % _WHOLE))
 
     def add(self, sent_ns: int, received_ns: int, clock32: int) -> bool:
-        """Process an answer to get_clock: SENT_NS 0 means unknown. Return whether it was usable."""
+        """Process the clock's low 32 bits as read: SENT_NS 0 means unknown. Return whether it was usable."""
         middle_ns = HostTime((sent_ns + received_ns) // 2)
         return self._take(sent_ns, received_ns, extend32(clock32, self.estimate().ticks_at(middle_ns)))
 

@@ -203,9 +203,10 @@ class EndstopPhase(Module):
                 f" {wanted}/{phases} was expected: that is more than endstop_accuracy; check the switch, or"
                 " ENDSTOP_PHASE_CALIBRATE again"
             )
-        # The trigger counts as being at a step: its time tells a part of one, which does not repeat as well.
-        part_mm = made.distance_mm - made.steps * stepper.step_distance
-        return sense * (off + self._off_zero(wanted, sense)) * forward * stepper.step_distance - part_mm
+        # The phase is that of a whole step. The time of the trigger also gives a fraction of a step, which does
+        # not belong to that phase and is not as repeatable.
+        fraction_mm = made.distance_mm - made.steps * stepper.step_distance
+        return sense * (off + self._off_zero(wanted, sense)) * forward * stepper.step_distance - fraction_mm
 
     def _off_zero(self, wanted: int, sense: int) -> float:
         """Return by how many phases the 0 of the axis is beyond the nearest full step, if that counts."""

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from nodes.clock.clock import SETTLE_SAMPLES, ClockEstimate
-from nodes.node.clock_keeper import ClockKeeper
+from nodes.node.clock_keeper import REST_INTERVAL_S, UPTIME, ClockKeeper
 from nodes.node.errors import NodeLost, NodeShutdown
 from nodes.node.request_reply import Answer, Query, RequestReply
 from nodes.node.watchdog import QUERIES
@@ -151,18 +151,58 @@ def test_what_else_is_asked_comes_behind_the_clock_on_a_line_of_unknown_bit_rate
     assert bench.answered == [["uptime", "config"]]
 
 
-def test_an_answer_that_is_missing_is_no_reading() -> None:
+@pytest.mark.parametrize(
+    ("queries", "answered", "readings"),
+    [
+        ((UPTIME, Query("get_clock", "config")), ["uptime", None], 1),
+        ((Query("get_clock", "uptime"), Query("get_config", "config")), [None, "config"], 0),
+    ],
+)
+def test_an_answer_that_is_missing_is_no_reading(
+    queries: tuple[Query, ...], answered: list[str | None], readings: int
+) -> None:
     bench = Bench(**{BITRATE: 250_000})
 
     async def learn(keeper: ClockKeeper) -> None:
         await keeper.ready.wait()
-        bench.queries = (*QUERIES[:1], Query("get_config", "uptime"))
+        bench.queries = queries
         bench.twin.executed.clear()
         await asyncio.sleep(1.5)
 
     assert bench.run(learn) == []
-    assert bench.answered == [["uptime", None]]
-    assert len(bench.estimates) == SETTLE_SAMPLES + 1
+    assert bench.answered == [answered]
+    assert len(bench.estimates) == SETTLE_SAMPLES + readings
+
+
+def test_a_clock_that_nothing_needs_is_asked_less_often() -> None:
+    bench = Bench()
+
+    async def learn(keeper: ClockKeeper) -> None:
+        keeper.rests = True
+        await keeper.ready.wait()
+        await asyncio.sleep(3 * REST_INTERVAL_S + 0.5)
+        keeper.rests = False
+        await asyncio.sleep(2 * REST_INTERVAL_S)
+
+    assert bench.run(learn) == []
+    steps_s = [b - a for a, b in zip(bench.sampled_s[:-1], bench.sampled_s[1:], strict=True)]
+    assert steps_s[SETTLE_SAMPLES - 1 :] == pytest.approx(
+        [REST_INTERVAL_S] * 4 + [0.9843] * len(steps_s[SETTLE_SAMPLES + 3 :]), abs=1e-6
+    )
+    assert len(steps_s) >= SETTLE_SAMPLES + 5
+
+
+def test_only_a_clock_in_doubt_is_in_a_hurry() -> None:
+    bench = Bench()
+    bench.talk.let_wait("clock", 0.1)
+
+    async def learn(keeper: ClockKeeper) -> None:
+        await keeper.ready.wait()
+        assert bench.link.hurries == [True, False] * SETTLE_SAMPLES
+        await asyncio.sleep(2.5)
+
+    assert bench.run(learn) == []
+    assert bench.link.hurries == [True, False] * SETTLE_SAMPLES
 
 
 def test_the_time_on_the_wire_is_taken_off_the_exchange() -> None:
