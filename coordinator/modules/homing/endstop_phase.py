@@ -203,8 +203,8 @@ class EndstopPhase(Module):
                 f" {wanted}/{phases} was expected: that is more than endstop_accuracy; check the switch, or"
                 " ENDSTOP_PHASE_CALIBRATE again"
             )
-        # The phase is that of a whole step. The time of the trigger also gives a fraction of a step, which does
-        # not belong to that phase and is not as repeatable.
+        # The phase is that of a whole step. The time of the trigger also gives a fraction of a step, which
+        # does not belong to that phase and is not as repeatable.
         fraction_mm = made.distance_mm - made.steps * stepper.step_distance
         return sense * (off + self._off_zero(wanted, sense)) * forward * stepper.step_distance - fraction_mm
 
