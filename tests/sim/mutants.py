@@ -124,9 +124,7 @@ def run_tests(folder: Path, tests: Sequence[str]) -> subprocess.CompletedProcess
     node_ids = [test for test in tests if not test.endswith(".c")]
     done = subprocess.CompletedProcess[str]([], 0, "", "")
     if programs:
-        names = " ".join(
-            "../build/ctest/" + test.removeprefix("tests/").removesuffix(".c") for test in programs
-        )
+        names = " ".join(test.removeprefix("tests/").removesuffix(".c") for test in programs)
         done = run(folder, ["make", "-C", "tests", f"TESTS={names}", f"PYTHON={sys.executable}"])
     if node_ids and not done.returncode:
         done = run(folder, [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *node_ids])

@@ -278,7 +278,7 @@ void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in) {
     link->outstanding_until_ns = now + link_rto(link);
     link->outstanding_until_seq = link->next;
     link->cursor = link->first;
-    link->in_flight_bytes = link->ignored_nak_ns = 0;
+    link->in_flight_bytes = link->late_bytes = link->ignored_nak_ns = 0;
     link->lead_in = (uint8_t)lead_in;
 }
 

@@ -113,6 +113,7 @@ struct link {
     struct link_block blocks[LINK_SLOTS];
     uint64_t first, cursor, next; // first unacknowledged <= next to transmit (again) <= next new block
     uint64_t in_flight_bytes;     // transmitted since the last rewind and not acknowledged
+    uint64_t late_bytes;          // of repeats acknowledged, perhaps by answers to earlier transmissions
     uint64_t in_flight_commands;  // in blocks [first, next)
     uint64_t motion_content;      // content bytes of motion commands sent so far, once each
     uint64_t progress_ns;         // last acknowledgement, or when the link stopped being idle

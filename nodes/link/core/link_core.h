@@ -49,7 +49,8 @@ uint64_t link_partial_deadline(const struct link *link);
 
 // Returns whether BYTES more fit into the node's receive window.
 static inline int link_fits(const struct link *link, size_t bytes) {
-    return link->in_flight_bytes == 0 || link->in_flight_bytes + bytes <= link->settings.receive_window;
+    uint64_t unread = link->in_flight_bytes + link->late_bytes;
+    return link->in_flight_bytes == 0 || unread + bytes <= link->settings.receive_window;
 }
 
 // The records at the front of a queue that may be sent now and fit together.

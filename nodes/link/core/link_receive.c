@@ -63,13 +63,22 @@ static void measure_round_trip(struct link *link, const struct link_block *block
     link->backoff = 0;
 }
 
+// The node has answered all repeats: no further naks are theirs, and it has read them.
+static void repeats_are_answered(struct link *link) {
+    link->naks_outstanding = link->late_bytes = 0;
+}
+
 // Everything before SEQUENCE has arrived.
 static void acknowledge(struct link *link, uint64_t sequence, uint64_t now) {
     measure_round_trip(link, block_of(link, sequence - 1), now);
     for (; link->first < sequence; link->first++) {
         const struct link_block *block = block_of(link, link->first);
-        if (link->first < link->cursor)
+        if (link->first < link->cursor) {
             link->in_flight_bytes -= block->wire_length;
+            // The answer may be one to an earlier transmission: the node may not have read this one yet.
+            if (block->repeats && link->naks_outstanding)
+                link->late_bytes += block->wire_length;
+        }
         link->in_flight_commands -= block->commands;
         if (link->clock_hz > 0)
             for (size_t i = 0; i < block->leads; i++)
@@ -80,7 +89,7 @@ static void acknowledge(struct link *link, uint64_t sequence, uint64_t now) {
     link->progress_ns = now;
     link->ignored_nak_ns = 0;
     if (sequence > link->outstanding_until_seq) // a block after the repeats was answered, and so were they
-        link->naks_outstanding = 0;
+        repeats_are_answered(link);
 }
 
 static void handle_nak(struct link *link, uint64_t now) {
@@ -88,7 +97,8 @@ static void handle_nak(struct link *link, uint64_t now) {
     if (link->cursor == link->first)
         return; // the repeat is on its way already
     if (link->naks_outstanding && now < link->outstanding_until_ns) {
-        link->naks_outstanding--;
+        if (--link->naks_outstanding == 0)
+            repeats_are_answered(link);
         link->ignored_nak_ns = now;
         return;
     }
@@ -99,7 +109,8 @@ static void handle_nak(struct link *link, uint64_t now) {
 
 static void adopt(struct link *link, uint64_t sequence) {
     link->first = link->cursor = link->next = sequence;
-    link->in_flight_bytes = link->naks_outstanding = 0;
+    link->in_flight_bytes = 0;
+    repeats_are_answered(link);
 }
 
 // The first answer to an empty block reports the node's expected sequence: the block was accepted, or refused
@@ -114,7 +125,7 @@ static void handle_probe_answer(struct link *link, unsigned answer, uint64_t now
     link->state = link_following(link->state, behind == 1 ? LINK_EVENT_TAKEN : LINK_EVENT_REFUSED);
     if (link->state == LINK_RUNNING) {
         acknowledge(link, link->first + 1, now);
-        link->naks_outstanding = 0;
+        repeats_are_answered(link);
         link->last_ack = link->first;
     } else {
         adopt(link, link->first + behind);

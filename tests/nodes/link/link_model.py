@@ -82,6 +82,7 @@ class LinkModel:
         self.progress_ns = self.heard_ns = self.silence_ns = self.silences = 0
         self.last_ack: int | None = None
         self.naks_outstanding = self.outstanding_until_ns = self.outstanding_until = 0
+        self.late_bytes = 0
         self.backoff = 0
         self.ignored_nak_ns = 0
         self.lead_in = "flush"
@@ -349,7 +350,7 @@ class LinkModel:
 
     def _fits(self, size: int) -> bool:
         in_flight = sum(self.slots[n % 16].on_wire for n in range(self.first, self.cursor))
-        return in_flight == 0 or in_flight + size <= self.window
+        return in_flight == 0 or in_flight + self.late_bytes + size <= self.window
 
     @property
     def _may_probe(self) -> bool:
@@ -445,7 +446,7 @@ class LinkModel:
         self.naks_outstanding = min(self.naks_outstanding + self.cursor - self.first, 2 * IN_FLIGHT_MAX)
         self.outstanding_until_ns, self.outstanding_until = now + self.rto_ns, self.next
         self.cursor = self.first
-        self.ignored_nak_ns = 0
+        self.ignored_nak_ns = self.late_bytes = 0
         if self.lead_in != "flush":
             self.lead_in = lead_in
 
@@ -548,11 +549,11 @@ class LinkModel:
         if self.state == "confirming" and behind == 1:
             self.state = "running"
             self._acknowledge(self.first + 1, now)
-            self.naks_outstanding, self.last_ack = 0, self.first
+            self.naks_outstanding, self.late_bytes, self.last_ack = 0, 0, self.first
             return
         self.state = "confirming"
         self.first = self.cursor = self.next = self.first + behind
-        self.naks_outstanding = 0
+        self.naks_outstanding = self.late_bytes = 0
 
     def _nak(self, now: int) -> None:
         self.count["naks"] += 1
@@ -560,6 +561,8 @@ class LinkModel:
             return
         if self.naks_outstanding and now < self.outstanding_until_ns:
             self.naks_outstanding -= 1
+            if not self.naks_outstanding:
+                self.late_bytes = 0
             self.ignored_nak_ns = now
             return
         self._rewind(now, "sync")
@@ -568,14 +571,17 @@ class LinkModel:
         last = self.slots[(sequence - 1) % 16]
         self._measure(max(now - last.sent_ns, 1), sure=not last.repeats)
         for number in range(self.first, sequence):
-            for req_clock in self.slots[number % 16].req_clocks:
+            sent = self.slots[number % 16]
+            if number < self.cursor and sent.repeats and self.naks_outstanding:
+                self.late_bytes += sent.on_wire
+            for req_clock in sent.req_clocks:
                 self._note_lead(req_clock, now)
         self.first = sequence
         self.cursor = max(self.cursor, sequence)
         self.progress_ns = now
         self.ignored_nak_ns = 0
         if sequence > self.outstanding_until:
-            self.naks_outstanding = 0
+            self.naks_outstanding = self.late_bytes = 0
 
     def _measure(self, sample_ns: int, *, sure: bool) -> None:
         """Take a round trip, or, of a repeat, what a round trip takes at least."""

@@ -327,12 +327,14 @@ static void repeats_stay_within_the_window(void) {
     CHECK_EQUAL(offer_of(&scene, LINK_ALL).kind, LINK_CLASSES);
     CHECK_EQUAL(go(&scene), 0);
     CHECK_EQUAL(deadline_of(&scene), scene.now + 40 * MS);
-    answer(&scene, scene.link.first + 1, 0);
-    CHECK_EQUAL(scene.link.in_flight_bytes, 64);
+    answer(&scene, scene.link.first + 2, 0);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 0);
     CHECK_OFFER(&scene, LINK_CONTROL, 0, 0);
     CHECK_EQUAL(go(&scene), 64);
-    CHECK_EQUAL(scene.link.in_flight_bytes, 128);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 64);
     CHECK_EQUAL(stats_of(&scene).bytes_repeated, 193);
+    CHECK_EQUAL(go(&scene), 0);
+    answer(&scene, scene.link.first + 1, 0);
     CHECK_EQUAL(go(&scene), 64);
     acknowledge_all(&scene);
     CHECK_EQUAL(scene.link.in_flight_bytes, 0);
@@ -451,6 +453,65 @@ static void an_acknowledgement_behind_the_repeats_ends_their_naks(void) {
     CHECK_EQUAL(scene.link.naks_outstanding, 3);
     acknowledge_all(&scene);
     CHECK_EQUAL(scene.link.naks_outstanding, 0);
+}
+
+// Three blocks of 60 bytes that go again, after which the answers to their first transmissions come, late:
+// the node may not have read the repeats yet. The next block goes, but not the one behind it.
+static void repeats_are_acknowledged_too_soon(struct scene *scene) {
+    open_running(scene, WINDOW);
+    for (char tag = 'a'; tag <= 'c'; tag++)
+        block_goes(scene, tag, 55);
+    time_passes(scene, scene->now + 20 * MS);
+    for (unsigned i = 0; i < 3; i++)
+        CHECK_EQUAL(go(scene), i ? 60 : 61);
+    control(scene, 'd', 55);
+    control(scene, 'e', 55);
+    for (unsigned i = 0; i < 2; i++) {
+        answer(scene, scene->link.first + 1, 0);
+        CHECK_EQUAL(go(scene), 0);
+        CHECK_EQUAL(scene->link.late_bytes, i ? 121 : 61);
+        CHECK_EQUAL(offer_of(scene, LINK_ALL).kind, LINK_CLASSES);
+    }
+    answer(scene, scene->link.first + 1, 0);
+    CHECK_EQUAL(scene->link.late_bytes, 181);
+    CHECK_EQUAL(go(scene), 60); // with nothing else in flight one block goes in any case
+    CHECK_EQUAL(go(scene), 0);
+}
+
+static void what_a_node_may_not_have_read_takes_room(void) {
+    struct scene scene;
+    repeats_are_acknowledged_too_soon(&scene);
+    for (unsigned i = 0; i < 3; i++) { // one for each repeat
+        CHECK_EQUAL(go(&scene), 0);
+        CHECK_EQUAL(scene.link.late_bytes, 181);
+        nak(&scene);
+    }
+    CHECK_EQUAL(scene.link.late_bytes, 0);
+    CHECK_EQUAL(go(&scene), 60);
+
+    repeats_are_acknowledged_too_soon(&scene);
+    answer(&scene, scene.link.next, 0); // the block behind the repeats: the node has read them
+    CHECK_EQUAL(scene.link.late_bytes, 0);
+    CHECK_EQUAL(go(&scene), 60);
+
+    repeats_are_acknowledged_too_soon(&scene);
+    time_passes(&scene, scene.now + SECOND / 2);
+    CHECK_EQUAL(scene.link.late_bytes, 0);
+    CHECK(go(&scene) > 0);
+}
+
+static void a_repeat_that_nothing_is_outstanding_of_has_been_read(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    for (char tag = 'a'; tag <= 'c'; tag++)
+        block_goes(&scene, tag, 55);
+    time_passes(&scene, scene.now + 20 * MS);
+    for (unsigned i = 0; i < 3; i++) {
+        CHECK(go(&scene) > 0);
+        nak(&scene);
+    }
+    answer(&scene, scene.link.next - 1, 0);
+    CHECK_EQUAL(scene.link.late_bytes, 0);
 }
 
 // 30: as many as two times the blocks that can be in flight.
@@ -735,6 +796,8 @@ int main(void) {
     a_repeat_presses_where_motion_or_an_emergency_is_behind_it();
     naks_that_repeats_may_cause_are_ignored();
     an_acknowledgement_behind_the_repeats_ends_their_naks();
+    what_a_node_may_not_have_read_takes_room();
+    a_repeat_that_nothing_is_outstanding_of_has_been_read();
     no_more_naks_are_ignored_than_can_come();
     what_is_acknowledged_is_not_repeated();
     a_part_may_be_acknowledged_while_it_is_repeated();
