@@ -77,6 +77,8 @@ class PulseFit:
         self._parabola: Any = ffi.new("struct pulse_parabola *")
         self.line: PulseLine | None = None
         """The newest fit; None before the first pair."""
+        self.line_before: PulseLine | None = None
+        """The fit before a jump, until there are enough pairs after it."""
         self.restarts = 0
         """Number of restarts of the fit after a jump of either clock."""
 
@@ -90,10 +92,14 @@ class PulseFit:
     def add(self, reference: Ticks, ticks: Ticks) -> None:
         """Add a pair of clocks latched together; pairs come in order."""
         if self.line is not None and self._jumped(self.line, reference, ticks):
+            if self.settled:
+                self.line_before = self.line
             self._pairs.clear()
             self.restarts += 1
         self._pairs.append((reference, ticks))
         self.line = self._fit(self._off_the_last_line())
+        if self.settled:
+            self.line_before = None
 
     def fill(self, pairs: Iterable[tuple[Ticks, Ticks]]) -> None:
         """Start again with PAIRS, in order; pairs before a jump of either clock do not count."""

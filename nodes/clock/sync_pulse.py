@@ -15,7 +15,7 @@ from typing import Final, Protocol
 
 from nodes.clock.clock import HostTime, Ticks, extend32
 from nodes.clock.estimated_clock import EstimatedClock
-from nodes.clock.pulse_fit import PAIRS_MAX, PulseFit, PulseLine
+from nodes.clock.pulse_fit import JUMP_S, PAIRS_MAX, PulseFit, PulseLine
 from nodes.dictionary.message_format import Message
 from nodes.support.awake import sleep_between
 from nodes.support.can_protocol import ADMIN_ID, SYNC_PULSE
@@ -130,6 +130,11 @@ class PulseRounds:
         if follower is None or follower.missed > MISSED_MAX or not follower.fit.settled:
             return None
         return follower.fit.line
+
+    def line_before(self, name: str) -> PulseLine | None:
+        """Return the fit of a follower before a clock jumped, while it settles after that, else None."""
+        follower = self._followers.get(name)
+        return follower.fit.line_before if follower is not None and follower.settling > 0 else None
 
     def _refer_to(self, reference: str, members: Mapping[str, int]) -> None:
         """Make REFERENCE the reference; fits to another node are converted to it at once."""
@@ -251,7 +256,21 @@ class PulseKeeper:
         reference = _clock_of(present.get(self.rounds.reference or ""))
         for node in nodes:
             line = self.rounds.line(node.name)
+            if line is None and reference is not None:
+                line = self._line_before(node, reference)
             node.pulse_clock = PulseClock(reference, line) if line and reference else None
+
+    def _line_before(self, node: PulseNode, reference: EstimatedClock) -> PulseLine | None:
+        """Return the fit before a jump that the host has not seen by its own queries.
+
+        It is far better than they are, and they tell in a second whether a clock has jumped in truth.
+        """
+        line, own = self.rounds.line_before(node.name), _clock_of(node)
+        if line is None or own is None:
+            return None
+        now_ns = self._now()
+        parted_ticks = own.ticks_at(now_ns) - line.ticks_at(reference.ticks_at(now_ns))
+        return line if abs(parted_ticks) < JUMP_S * node.clock_freq_hz else None
 
 
 def _clock_of(node: PulseNode | None) -> EstimatedClock | None:

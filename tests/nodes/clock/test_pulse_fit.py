@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nodes.clock.clock import Ticks
-from nodes.clock.pulse_fit import PulseFit, PulseLine
+from nodes.clock.pulse_fit import SETTLE_PAIRS, PulseFit, PulseLine
 from tests.nodes.bounds import Array
 
 REFERENCE_HZ, FREQ_HZ = 168_000_000, 64_000_000
@@ -154,6 +154,27 @@ def test_clocks_that_part_by_more_than_crystals_do_have_jumped(
         for line in (one.line, other.line):
             assert (line.rate == 0.0) is jumped, "a single pair says nothing of the rate"
             assert (line.reference, line.ticks) == second
+
+
+def test_the_fit_before_a_jump_is_kept_until_there_are_enough_pairs_after_it() -> None:
+    fit = PulseFit(REFERENCE_HZ, FREQ_HZ)
+
+    def latch(begin_s: float, count: int, ahead_s: float) -> None:
+        for i in range(count):
+            reference, ticks = latched(begin_s + 0.3 * i)
+            fit.add(reference, Ticks(ticks + round(ahead_s * FREQ_HZ)))
+
+    latch(0.0, SETTLE_PAIRS, 0.0)
+    before = fit.line
+    assert fit.line_before is None
+    latch(10.0, 1, 0.5)
+    assert fit.line_before is before is not fit.line
+    latch(11.0, 1, 0.0)  # it jumps back, and what follows the second jump is no better than what preceded
+    assert fit.line_before is before
+    latch(12.0, SETTLE_PAIRS - 2, 0.0)
+    assert fit.line_before is before
+    latch(20.0, 1, 0.0)
+    assert (fit.settled, fit.line_before) == (True, None)
 
 
 def test_a_reference_that_stands_still_or_goes_back_has_jumped() -> None:

@@ -244,6 +244,32 @@ def test_what_was_latched_before_a_restart_does_not_count_for_another_reference(
     assert abs(play.off("c")) <= 1
 
 
+def test_the_line_before_a_jump_is_known_while_the_node_settles() -> None:
+    play = Play()
+    play(30)
+    assert play.rounds.line_before("c") is None
+    before = play.rounds.line("c")
+    play.restarted["c"] = 20
+    play(1)
+    assert play.rounds.line("c") is None
+    assert play.rounds.line_before("c") is before is not None
+    assert play.rounds.line_before("a") is play.rounds.line_before("b") is None
+    play(SETTLE_PAIRS - 1)
+    assert play.rounds.line_before("c") is None
+    assert abs(play.off("c")) <= 1
+
+
+def test_a_line_before_a_jump_is_given_up_when_the_node_does_not_settle() -> None:
+    play = Play()
+    play(30)
+    play.restarted["c"] = 20
+    play(1)
+    play(SETTLE_ROUNDS - 1, silent="c")
+    assert play.rounds.line_before("c") is not None
+    play(1, silent="c")
+    assert play.rounds.line_before("c") is None
+
+
 def test_a_node_that_was_away_is_relied_on_only_when_it_was_heard_again() -> None:
     play = Play()
     play(30)
@@ -297,7 +323,7 @@ class Bus:
         self.pulses += 1
         for node in self.nodes:
             if self.random.random() >= self.loss:
-                node.latched = (data[1], node.true_ticks() % 2**32)
+                node.latched = (data[1], node.true_ticks(node.lies_s) % 2**32)
 
 
 class FakeNode:
@@ -309,6 +335,10 @@ class FakeNode:
         self.pulse_clock: PulseClock | None = None
         self.latched = (0, 0)
         self.lost = False
+        self.lies_s = 0.0
+        """By how much what it latches is ahead of its clock."""
+        self.seen_s = 0.0
+        """By how much the host believes it to be ahead."""
         self.patient: list[bool] = []
         """Whether each question had time."""
         self._bus = bus
@@ -324,7 +354,7 @@ class FakeNode:
         return self._start + round((asyncio.get_running_loop().time() + ahead_s) * self._rate)
 
     def ticks_at(self, at_ns: HostTime, /) -> Ticks:
-        return Ticks(self._start + round((at_ns * 1e-9 + 100e-6) * self._rate))
+        return Ticks(self._start + round((at_ns * 1e-9 + 100e-6 + self.seen_s) * self._rate))
 
     def ns_at(self, ticks: Ticks, /) -> HostTime:
         return HostTime(round(((ticks - self._start) / self._rate - 100e-6) * 1e9))
@@ -389,6 +419,31 @@ def test_a_follower_agrees_with_the_reference_whatever_the_host_believes(loss: f
 
     keep(bus, 5.0, look, look, look)
     assert max(map(abs, errors)) < 0.5e-6
+
+
+def test_a_follower_whose_pulses_lie_keeps_its_clock_until_the_host_has_seen_a_jump() -> None:
+    bus = Bus(1, 0.0)
+    _, second = two_nodes(bus)
+    before: list[PulseClock | None] = []
+
+    def lie() -> None:
+        before.append(second.pulse_clock)
+        second.lies_s = 0.2
+
+    def see() -> None:
+        assert second.pulse_clock == before[0] is not None
+        assert not second.patient[-1], "it has lied"
+        second.seen_s = 0.2
+
+    def look() -> None:
+        assert second.pulse_clock is None
+
+    def look_again() -> None:
+        assert second.pulse_clock is not None
+        assert second.pulse_clock != before[0]
+
+    nothing = [lambda: None]
+    keep(bus, 0.5, *nothing * 5, lie, *nothing, see, look, *nothing, look_again)
 
 
 def test_answers_are_urgent_until_the_clocks_are_known() -> None:
