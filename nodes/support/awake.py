@@ -1,7 +1,6 @@
 """Timers with slack: what has time until an event loop is awake anyway, which is woken once for all then."""
 
 import asyncio
-import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
@@ -39,7 +38,12 @@ async def sleep_between(least_s: float, most_s: float) -> None:
     loop = asyncio.get_running_loop()
     over = loop.create_future()
     now_s = loop.time()
-    cancel = call_between(now_s + least_s, now_s + most_s, functools.partial(over.set_result, None))
+
+    def wake() -> None:
+        if not over.done():  # whoever sleeps may have been cancelled, and not have been told yet
+            over.set_result(None)
+
+    cancel = call_between(now_s + least_s, now_s + most_s, wake)
     try:
         await over
     finally:

@@ -39,3 +39,18 @@ def test_a_sleep_that_is_cancelled_leaves_nothing_behind() -> None:
         await asyncio.sleep(2.0)
 
     virtual_time.run(main())
+
+
+def test_a_sleeper_that_is_cancelled_when_its_time_has_come_is_only_cancelled() -> None:
+    failures: list[object] = []
+
+    async def main() -> bool:
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: failures.append(context))
+        sleeping = asyncio.ensure_future(sleep_between(1.0, 1.0))
+        loop.call_at(loop.time() + 1.0, sleeping.cancel)
+        await asyncio.wait([sleeping])
+        return sleeping.cancelled()
+
+    assert virtual_time.run(main())
+    assert failures == []
