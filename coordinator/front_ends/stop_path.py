@@ -70,9 +70,9 @@ class StopPath:
             self._loop.call_soon_threadsafe(machine.stop_as_announced)
         machine.stop_nodes()
 
-    def _while_held(self) -> None:
+    def _while_held(self, is_held: Callable[[], bool]) -> None:
         self._looked_for = self._service.machine
-        self.lane.look()
+        self.lane.look(is_held)
         if (
             isinstance(self._loop, WatchedLoop)
             and self._service.moves

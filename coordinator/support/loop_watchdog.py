@@ -7,6 +7,7 @@ calls of the system for each rest, and wakes nobody while the loop is quick. It 
 
 import asyncio
 import ctypes
+import functools
 import os
 import select
 import selectors
@@ -200,11 +201,14 @@ class LoopWatchdog:
     """Watches LOOP from ``start`` to ``close``, both on it.
 
     REPORT gets a sentence when something held the loop, on the loop; WHILE_HELD is called in the watchdog's
-    thread again and again while something does.
+    thread again and again while something does, with what tells whether that is still so.
     """
 
     def __init__(
-        self, loop: WatchedLoop, report: Callable[[str], None], while_held: Callable[[], None]
+        self,
+        loop: WatchedLoop,
+        report: Callable[[str], None],
+        while_held: Callable[[Callable[[], bool]], None],
     ) -> None:
         self._loop = loop
         self._report = report
@@ -243,7 +247,7 @@ class LoopWatchdog:
             usual_s = sys.getswitchinterval()
             sys.setswitchinterval(TURN_S)
             try:
-                self._while_held()
+                self._while_held(functools.partial(self._is_held, since_s))
                 self._look(since_s)
             except Exception:  # noqa: BLE001 (it has to go on: it may be what stops the machine)
                 if self._failed_s != since_s:  # once for each hold
@@ -251,6 +255,9 @@ class LoopWatchdog:
                 self._failed_s = since_s
             finally:
                 sys.setswitchinterval(usual_s)
+
+    def _is_held(self, since_s: float) -> bool:
+        return self._selector.busy_since_s == since_s
 
     def _look(self, since_s: float) -> None:
         """Report a hold that began at SINCE_S, once."""

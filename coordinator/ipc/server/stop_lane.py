@@ -13,8 +13,8 @@ import os
 import socket
 import threading
 from asyncio.trsock import TransportSocket
-from collections.abc import Callable, Hashable
-from typing import Final
+from collections.abc import Callable, Hashable, Iterator
+from typing import Any, Final
 
 FindStop = Callable[[bytes], str | None]
 """Returns who stops the machine with bytes that are unread; None: nobody does. In any thread."""
@@ -34,18 +34,38 @@ def _ignore(_: str) -> None:
     pass
 
 
+def _to_the_end() -> bool:
+    return True
+
+
 class StopLane:
-    """Looks at what is unread; STOP is called with who stops the machine, in the thread that has looked."""
+    """Looks at what is unread; STOP is called with who stops the machine, in the thread that has looked.
+
+    A look takes tens of ms when many clients have sent much. It ends when the loop goes on, and the loop
+    waits for one finder at most.
+    """
 
     def __init__(self, stop: Callable[[str], None] = _ignore) -> None:
         self._stop = stop
         self._lock = threading.Lock()
+        """For one finder at a time."""
+        self._next = threading.Lock()
+        """Of who takes the lock next: a look, which takes it again and again, has to wait its turn."""
         self._unread: dict[Hashable, Finder] = {}
         self._new: dict[socket.socket, Finder] = {}
         """Of connections without a protocol."""
         self._peeking: dict[Hashable, socket.socket] = {}
-        self._finders: list[Finder] = []
+        self._others: dict[Finder, Finder] = {}
         self._accepting: dict[Hashable, Callable[[], None]] = {}
+
+    @contextlib.contextmanager
+    def _turn(self) -> Iterator[None]:
+        with self._next:
+            self._lock.acquire()
+        try:
+            yield
+        finally:
+            self._lock.release()
 
     # ---- On the loop ----
 
@@ -70,14 +90,14 @@ class StopLane:
 
     def watch_with(self, key: Hashable, opened: socket.socket | TransportSocket, find: Finder) -> None:
         """Ask FIND about OPENED, until ``forget`` of KEY; it is not new any more."""
-        with self._lock:
+        with self._turn():
             self._unread[key] = find
             for new in [new for new in self._new if new.fileno() == opened.fileno()]:
                 del self._new[new]
 
     def forget(self, key: Hashable) -> None:
         """Look at it no more, or listen there no more; without effect for an unknown KEY."""
-        with self._lock:
+        with self._turn():
             self._unread.pop(key, None)
             self._accepting.pop(key, None)
             if (own := self._peeking.pop(key, None)) is not None:
@@ -85,33 +105,33 @@ class StopLane:
 
     def settle(self, opened: socket.socket) -> None:
         """Look no more at OPENED as a new connection: it has its protocol, or was given up."""
-        with self._lock:
+        with self._turn():
             self._new.pop(opened, None)
 
     def listen(self, key: Hashable, accept: Callable[[], None]) -> None:
         """Call ACCEPT at each look, until ``forget`` of KEY: it takes new connections."""
-        with self._lock:
+        with self._turn():
             self._accepting[key] = accept
 
     def look_also(self, find: Finder) -> None:
         """Ask FIND as well: it looks where there is no socket."""
-        with self._lock:
-            self._finders.append(find)
+        with self._turn():
+            self._others[find] = find
 
     def close(self) -> None:
         """Let go of all."""
-        with self._lock:
+        with self._turn():
             for own in self._peeking.values():
                 own.close()
             self._unread.clear()
             self._new.clear()
             self._peeking.clear()
             self._accepting.clear()
-            self._finders.clear()
+            self._others.clear()
 
     def look_at_new(self, opened: socket.socket) -> bool:
         """Look at OPENED, just accepted; return whether to look again: it is new still, and stops nothing."""
-        with self._lock:
+        with self._turn():
             find = self._new.get(opened)
             who = None if find is None else find()
         if who is not None:
@@ -121,8 +141,7 @@ class StopLane:
     def find(self) -> str | None:
         """Return who stops the machine with what is unread; None: nobody. Stops nothing."""
         failures: list[Exception] = []
-        with self._lock:
-            who = self._find(failures)
+        who = self._find(failures, _to_the_end)
         if who is None and failures:
             raise failures[0]
         return who
@@ -131,32 +150,42 @@ class StopLane:
 
     def watch_new(self, opened: socket.socket, find: Finder) -> None:
         """Ask FIND about OPENED, just accepted, until it is watched under a key, or ``settle`` of it."""
-        with self._lock:
+        with self._turn():
             self._new[opened] = find
 
     # ---- In the lane's thread ----
 
-    def look(self) -> None:
-        """Look at everything once; a failure hides no stop found elsewhere, and is raised at the end."""
+    def look(self, is_held: Callable[[], bool] = _to_the_end) -> None:
+        """Look at everything once, while IS_HELD says that the loop does not read it itself.
+
+        A failure hides no stop found elsewhere, and is raised at the end.
+        """
         failures: list[Exception] = []
-        with self._lock:
+        with self._turn():
             accepting = list(self._accepting.values())
         for accept in accepting:
             try:
                 accept()
             except Exception as error:  # noqa: BLE001 (as above)
                 failures.append(error)
-        with self._lock:
-            who = self._find(failures)
+        who = self._find(failures, is_held)
         if who is not None:
             self._stop(who)
         if failures:
             raise failures[0]
 
-    def _find(self, failures: list[Exception]) -> str | None:
-        for find in (*self._finders, *self._unread.values(), *self._new.values()):
+    # ---- On the loop, or in the lane's thread ----
+
+    def _find(self, failures: list[Exception], goes_on: Callable[[], bool]) -> str | None:
+        tables: tuple[dict[Any, Finder], ...] = self._others, self._unread, self._new
+        with self._turn():
+            watched = [(table, key) for table in tables for key in table]
+        for table, key in watched:
+            if not goes_on():
+                return None
             try:
-                who = find()
+                with self._turn():
+                    who = table[key]() if key in table else None
             except Exception as error:  # noqa: BLE001 (as above)
                 failures.append(error)
                 continue

@@ -33,7 +33,7 @@ def _service() -> MachineService:
 
 def look(path: StopPath) -> None:
     """Look as the watchdog's thread does, while the loop has no turn."""
-    thread = threading.Thread(target=path._while_held)
+    thread = threading.Thread(target=path._while_held, args=(lambda: True,))
     thread.start()
     thread.join()
 

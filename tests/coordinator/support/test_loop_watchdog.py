@@ -23,6 +23,7 @@ class Watched:
         self.reports: list[str] = []
         self.threads: set[int] = set()
         self.looks: Callable[[], None] = lambda: None
+        self.is_held: Callable[[], bool]
         self._since_s = 0.0
         self._late_looks = 0
         self._over = threading.Event()
@@ -32,7 +33,9 @@ class Watched:
         self._over.clear()
         assert self._over.wait(PATIENCE_S)
 
-    def while_held(self) -> None:
+    def while_held(self, is_held: Callable[[], bool]) -> None:
+        assert is_held()
+        self.is_held = is_held
         self.threads.add(threading.get_ident())
         self.looks()
         self._late_looks += time.monotonic() - self._since_s > HELD_S
@@ -68,6 +71,12 @@ def test_who_holds_the_loop_is_named_and_others_are_counted() -> None:
     assert "main (" not in report, "nor who runs the loop"
     assert "it calculated for " in report
     assert threading.get_ident() not in watched.threads
+
+
+def test_a_hold_is_over_when_the_loop_goes_on() -> None:
+    watched, held = Watched(), list[bool]()
+    watched.run(watched.hold_the_loop, lambda: held.append(watched.is_held()))
+    assert held == [False]
 
 
 def test_a_loop_that_calculates_gives_the_thread_its_turns() -> None:

@@ -1,9 +1,11 @@
 """Emergency stops that wait unread while the loop is held: by the test, which gives it no turn."""
 
 import asyncio
+import functools
 import json
 import socket
 import ssl
+import threading
 import time
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
@@ -47,15 +49,16 @@ class Lane(StopLane):
         self.early: list[str] = []
         """Found on new connections by the loop."""
         self._found = self.early
+        self.done = False
         super().__init__(self._note)
 
     def _note(self, who: str) -> None:
         self._found.append(who)
 
-    def look(self) -> None:
+    def look(self, is_held: Callable[[], bool] = lambda: True) -> None:
         self._found = self.stops
         try:
-            super().look()
+            super().look(is_held)
         finally:
             self._found = self.early
 
@@ -407,6 +410,38 @@ def test_a_look_that_fails_hides_no_stop() -> None:
     with pytest.raises(OSError, match="closed"):
         lane.look()
     assert lane.stops == ["me"]
+
+
+def test_a_look_ends_when_the_loop_goes_on() -> None:
+    lane, looked = Lane(), list[int]()
+    for number in range(5):
+        lane.look_also(functools.partial(looked.append, number))
+    lane.look(lambda: len(looked) < 2)
+    assert looked == [0, 1]
+
+
+def test_the_loop_waits_for_one_finder_at_most() -> None:
+    """Failed before: a TLS connection that came took 30 ms more while clients had sent much."""
+    lane, begun, looked = Lane(), threading.Event(), list[int]()
+
+    def find_slowly(number: int) -> None:
+        looked.append(number)
+        begun.set()
+        until_s = time.monotonic() + PATIENCE_S
+        while not lane._next.locked() and not lane.done and time.monotonic() < until_s:
+            time.sleep(0.001)
+
+    for number in range(5):
+        lane.look_also(functools.partial(find_slowly, number))
+    thread = threading.Thread(target=lane.look)
+    thread.start()
+    assert begun.wait(PATIENCE_S)
+    lane.forget("a connection")  # as the loop does
+    found = len(looked)
+    lane.done = True
+    thread.join()
+    assert found == 1
+    assert looked == [0, 1, 2, 3, 4]
 
 
 def test_a_new_connection_that_has_closed_is_no_failure(tmp_path: Path) -> None:
