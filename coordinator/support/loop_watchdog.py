@@ -201,7 +201,7 @@ class LoopWatchdog:
     """Watches LOOP from ``start`` to ``close``, both on it.
 
     REPORT gets a sentence when something held the loop, on the loop; WHILE_HELD is called in the watchdog's
-    thread again and again while something does, with what tells whether that is still so.
+    thread again and again while something does; its argument returns whether that is still so.
     """
 
     def __init__(

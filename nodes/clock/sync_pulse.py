@@ -261,9 +261,9 @@ class PulseKeeper:
             node.pulse_clock = PulseClock(reference, line) if line and reference else None
 
     def _line_before(self, node: PulseNode, reference: EstimatedClock) -> PulseLine | None:
-        """Return the fit before a jump that the host has not seen by its own queries.
+        """Return the fit before a jump while the host's own queries show no jump.
 
-        It is far better than they are, and they tell in a second whether a clock has jumped in truth.
+        It is more accurate than they are, and they show a real jump within about a second.
         """
         line, own = self.rounds.line_before(node.name), _clock_of(node)
         if line is None or own is None:

@@ -40,7 +40,7 @@ async def sleep_between(least_s: float, most_s: float) -> None:
     now_s = loop.time()
 
     def wake() -> None:
-        if not over.done():  # whoever sleeps may have been cancelled, and not have been told yet
+        if not over.done():  # the task may have been cancelled in this iteration of the loop
             over.set_result(None)
 
     cancel = call_between(now_s + least_s, now_s + most_s, wake)

@@ -47,7 +47,8 @@ uint64_t link_rto(const struct link *link);
 // Returns when an incomplete block in the receive buffer is given up; LINK_NEVER without one.
 uint64_t link_partial_deadline(const struct link *link);
 
-// Returns whether BYTES more fit into the node's receive window.
+// Returns whether BYTES more fit into the node's receive window. With nothing in flight they always do: no
+// answer would come that makes room.
 static inline int link_fits(const struct link *link, size_t bytes) {
     uint64_t unread = link->in_flight_bytes + link->late_bytes;
     return link->in_flight_bytes == 0 || unread + bytes <= link->settings.receive_window;
