@@ -74,12 +74,12 @@ class TlsState:
         """
         loop = asyncio.get_running_loop()
         transport = TlsTransport(loop, self, make_protocol)
-        raw, _ = await loop.connect_accepted_socket(lambda: _Carrier(transport), opened)
+        await loop.connect_accepted_socket(lambda: _Carrier(transport), opened)
         try:
             async with asyncio.timeout(handshake_s):
                 await transport.ready
         except BaseException:
-            raw.abort()
+            transport.abort()
             raise
 
     def carried_by(self, raw: asyncio.Transport, on_news: Callable[[], None]) -> None:
@@ -199,6 +199,7 @@ class TlsTransport(EncryptedTransport):
         self._raw: asyncio.Transport
         self._paused = False
         self._closing = False
+        self._lost = False
 
     # ------------------------------------------------------------------------------- beside the loop
 
@@ -222,7 +223,7 @@ class TlsTransport(EncryptedTransport):
 
     def lost(self, error: Exception | None) -> None:
         """End: the connection is gone."""
-        self._closing = True
+        self._closing = self._lost = True
         self._read_no_more()
         self._state.release()
         if not self.ready.done():
@@ -328,10 +329,11 @@ class TlsTransport(EncryptedTransport):
             self._raw.close()
 
     def abort(self) -> None:
-        """End it at once."""
+        """End it at once, unless it is gone."""
         self._closing = True
         self._read_no_more()
-        self._raw.abort()
+        if not self._lost:  # asyncio would end it again if it went while there was something to be sent
+            self._raw.abort()
 
 
 class _Carrier(asyncio.Protocol):

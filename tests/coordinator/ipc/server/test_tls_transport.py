@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+import socket
 import ssl
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -195,6 +196,35 @@ def test_what_is_no_tls_ends_it(certificate: tuple[Path, Path]) -> None:
         assert bytes(guest.got) == b"sound"
 
     run(certificate, body)
+
+
+def test_a_handshake_that_fails_while_the_client_does_not_read_ends_once(
+    certificate: tuple[Path, Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Failed before: asyncio, asked to end what it had ended, logged a traceback."""
+
+    async def main() -> None:
+        ours, theirs = socket.socketpair()
+        for end in (ours, theirs):
+            end.setblocking(False)
+        filling = 0
+        with suppress(BlockingIOError):
+            while True:
+                filling += ours.send(b"x")
+        theirs.send(b"\x16\x03\x01\x00\x05\x01\x00\x00\x01\x00")  # a hello that is too short
+        serving = asyncio.ensure_future(TlsServer(*certificate).begin(ours.dup()).serve(Guest, ours, 5.0))
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert not serving.done(), "an alert is still to be sent"
+        while filling > 0:
+            filling -= len(theirs.recv(4096))
+        with pytest.raises(OSError, match="during the handshake"):
+            await serving
+        await asyncio.sleep(0.1)
+        theirs.close()
+
+    jump_loop.run(main())
+    assert not caplog.records
 
 
 def test_a_protocol_with_a_buffer(certificate: tuple[Path, Path]) -> None:
