@@ -7,8 +7,10 @@ calls of the system for each rest, and wakes nobody while the loop is quick. It 
 
 import asyncio
 import ctypes
+import faulthandler
 import functools
 import os
+import re
 import select
 import selectors
 import socket
@@ -17,7 +19,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from types import FrameType
 from typing import Any, Final
 
 from nodes.support.awake import WakingLoop
@@ -32,16 +33,20 @@ HELD_S: Final = 0.05
 REPORT_EVERY_S: Final = 10.0
 """Reports between are left out, and counted."""
 TURN_S: Final = 0.0001
-"""The interpreter's switch interval while the thread works. A loop that calculates takes the interpreter at
-each of the thread's calls of the system; with the usual interval it would give it back after 5 ms."""
+"""The interpreter's switch interval while the loop is watched. Who calculates takes the interpreter at each
+call of the system that another thread makes, and with the usual interval would give it back after 5 ms."""
 STUCK_S: Final = 2.0
 """A loop that is held for so long may never write its log: the report goes to standard error."""
 FRAMES_MAX: Final = 8
 """Of a report, the innermost ones."""
+STACKS_BYTES_MAX: Final = 1 << 20
+"""faulthandler writes 100 calls of 100 threads at most."""
 _CLOCK_MONOTONIC: Final = 1
 _CLOSE_ON_EXEC: Final = os.O_CLOEXEC
 _SIGNALS_BYTES: Final = 65_536
 _STANDARD_ERROR: Final = 2
+_CALL: Final = re.compile(r'^  File "(.*)", line (\d+|\?\?\?) in (.*)$', re.MULTILINE)
+"""As faulthandler writes it."""
 
 
 class _Times(ctypes.Structure):
@@ -216,18 +221,21 @@ class LoopWatchdog:
         self._selector = loop.watched
         self._loop_thread = threading.get_ident()
         self._thread = threading.Thread(target=self._run, name="loop watchdog", daemon=True)
+        self._usual_switch_s = sys.getswitchinterval()
         self._closing = False
         self._reported_s = -REPORT_EVERY_S
         self._left_out = 0
         self._seen_s = 0.0
         self._stuck_s = 0.0
         self._failed_s = 0.0
+        self._stacks = _Stacks()
         self._cpu_clock = time.pthread_getcpuclockid(self._loop_thread)
         self._first = (0.0, 0.0, 0.0)
         """Of the hold at hand: since when, when it was looked at first, the loop's processor time then."""
 
     def start(self) -> None:
         """Begin to watch."""
+        sys.setswitchinterval(TURN_S)
         self._thread.start()
 
     def close(self) -> None:
@@ -235,6 +243,8 @@ class LoopWatchdog:
         self._closing = True
         self._selector.timer.arm()
         self._thread.join()
+        self._stacks.close()
+        sys.setswitchinterval(self._usual_switch_s)
 
     def _run(self) -> None:
         while True:
@@ -244,8 +254,6 @@ class LoopWatchdog:
             since_s = self._selector.busy_since_s
             if not since_s:
                 continue
-            usual_s = sys.getswitchinterval()
-            sys.setswitchinterval(TURN_S)
             try:
                 self._while_held(functools.partial(self._is_held, since_s))
                 self._look(since_s)
@@ -253,8 +261,6 @@ class LoopWatchdog:
                 if self._failed_s != since_s:  # once for each hold
                     _say(traceback.format_exc())
                 self._failed_s = since_s
-            finally:
-                sys.setswitchinterval(usual_s)
 
     def _is_held(self, since_s: float) -> bool:
         return self._selector.busy_since_s == since_s
@@ -287,22 +293,41 @@ class LoopWatchdog:
             return
 
     def _where(self) -> str:
-        return stack_of(sys._current_frames().get(self._loop_thread))  # noqa: SLF001 (its documented use)
+        return self._stacks.of(self._loop_thread)
 
     def _tell(self, since_s: float, where: str, more: str) -> None:
         held_ms = (time.monotonic() - since_s) * 1e3
         self._report(f"the control loop was held for {held_ms:.0f} ms by {where}{more}; please report it")
 
 
-def stack_of(frame: FrameType | None) -> str:
-    """Return the innermost functions that FRAME stands in, the last one first, without asyncio's own."""
-    calls = []
-    for call in reversed(traceback.extract_stack(frame)):
-        if call.name == "_run_once":
-            break  # the rest is who runs the loop
-        if "/asyncio/" not in call.filename:
-            calls.append(f"{call.name} ({'/'.join(call.filename.split('/')[-2:])}:{call.lineno})")
-    return " < ".join(calls[:FRAMES_MAX]) or "asyncio itself"
+class _Stacks:
+    """What threads are doing, as the interpreter itself writes it.
+
+    Frames of a thread that goes on meanwhile must not be looked at from Python: with CPython 3.11 their
+    ``f_back`` was found to be something else. faulthandler writes all stacks before any thread goes on.
+    """
+
+    def __init__(self) -> None:
+        self._fd = os.memfd_create("stacks")
+
+    def of(self, thread: int) -> str:
+        """Return the innermost functions of the thread THREAD, the last first, without asyncio's own."""
+        os.ftruncate(self._fd, 0)
+        os.lseek(self._fd, 0, os.SEEK_SET)
+        faulthandler.dump_traceback(self._fd, all_threads=True)
+        stacks = os.pread(self._fd, STACKS_BYTES_MAX, 0).decode(errors="replace").split("\n\n")
+        head = re.compile(f".*hread 0x0*{thread:x} ")
+        calls = []
+        for path, line, name in _CALL.findall(next(filter(head.match, stacks), "")):
+            if name == "_run_once":
+                break  # the rest is who runs the loop
+            if "/asyncio/" not in path:
+                calls.append(f"{name} ({'/'.join(path.split('/')[-2:])}:{line})")
+        return " < ".join(calls[:FRAMES_MAX]) or "asyncio itself"
+
+    def close(self) -> None:
+        """Let go of the memory."""
+        os.close(self._fd)
 
 
 def _say(text: str) -> None:
