@@ -38,6 +38,10 @@ class OpenService(HeldService):
     ways: dict[str, Any]
     """Ports and links by their names."""
 
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.own_process = True
+
     @asynccontextmanager
     async def interfaces(self) -> AsyncIterator[None]:
         """Serve on all ways in."""

@@ -51,6 +51,8 @@ class HeldService:
         self.stop_path: StopPath
         self.terminal = -1
         """Where a user types, if it is the service's own."""
+        self.own_process = False
+        """Whether nothing else is in this process."""
 
     @property
     def fan_turns(self) -> bool:
@@ -121,7 +123,7 @@ class HeldService:
     async def interfaces(self) -> AsyncIterator[None]:
         """Serve on all ways in."""
         registry = Registry()
-        settings = ServiceSettings(name="held", jobs=self.folder)
+        settings = ServiceSettings(name="held", jobs=self.folder, own_process=self.own_process)
         self.service = MachineService(
             lambda: load_machine(str(self.folder / CONFIG)),
             LinuxHost(),

@@ -23,7 +23,7 @@ from coordinator.ipc.server.state import StateTree
 from coordinator.modules.module_set import build_modules
 from coordinator.runtime.host import Host
 from coordinator.runtime.machine import Machine, MachineStopped
-from coordinator.service.core.memory import give_back, keep_small, pass_by_what_stays
+from coordinator.service.core.memory import collect_garbage, give_back, keep_small, pass_by_what_stays
 from coordinator.service.core.motion import Motion
 from coordinator.service.core.programs import Programs
 from coordinator.service.core.tables import TableService
@@ -165,6 +165,8 @@ class MachineService:
         refresh = asyncio.ensure_future(self._refresh())
         try:
             while True:
+                if self.settings.own_process:
+                    collect_garbage()  # while there is nothing to be stopped
                 await self._live_once()
                 await self._restart.wait()
                 await self._let_go()
