@@ -5,7 +5,8 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.fuzz.live_stops import BOUNDS_MS, WAYS, Found, Stop, table, verdict
+from tests.fuzz.live_stops import BOUNDS_MS, WAYS, Found, Stop, late, table, verdict
+from tests.fuzz.standstill import stood_still_ms
 
 
 def sound() -> Found:
@@ -42,6 +43,24 @@ def test_a_late_stop_is_wrong(state: str) -> None:
     taken_ms[late] = BOUNDS_MS[state] + 0.01
     (sentence,) = verdict(found, taken_ms)
     assert f"the loop {state}, took {taken_ms[late]:.2f} ms" in sentence
+
+
+@pytest.mark.parametrize(("stood_ns", "is_excused"), [(2_000_000, True), (1_900_000, False)])
+def test_a_stop_that_is_late_as_the_computer_stood_still_is_shown_but_not_judged(
+    stood_ns: int, is_excused: bool
+) -> None:
+    found = Found([Stop("TCP, new", "free", 1_000_000)], stood_still=[(4_000_000, 4_000_000 + stood_ns)])
+    ((sentence, excused),) = late(found, [12.0])
+    assert "took 12.00 ms" in sentence
+    assert excused == is_excused
+    assert (sentence in verdict(found, [12.0])) != is_excused
+
+
+def test_time_in_which_two_processors_stood_still_counts_once() -> None:
+    spans = [(1_000_000, 3_000_000), (2_000_000, 4_000_000), (2_500_000, 2_600_000), (9_000_000, 11_000_000)]
+    assert stood_still_ms(spans, 0, 10_000_000) == pytest.approx(4.0)
+    assert stood_still_ms(spans, 3_500_000, 9_500_000) == pytest.approx(1.0)
+    assert stood_still_ms(spans, 5_000_000, 8_000_000) == 0
 
 
 def test_the_table_has_the_worst_of_each_state() -> None:
