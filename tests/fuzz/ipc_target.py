@@ -95,7 +95,9 @@ def run_session(data: bytes, cuts: int = 1) -> None:
         session.writable = cuts & 0x10000 != 0 or position >= len(data)
         for request in session.read(now_s):
             session.answer(request, request.method.call(session.caller, request.params))  # type: ignore[arg-type]
-        while (waiting := session.next_request(now_s)) is not None:
+        while (waiting := session.next_request()) is not None:
+            if session.perform(waiting, now_s):
+                continue
             if waiting.method.name == "slow":
                 slow.append(waiting)
                 break

@@ -140,16 +140,12 @@ class Connection(asyncio.BufferedProtocol):
         session, now_s = self.session, self._loop.time()
         for request in session.read(now_s) if session.should_read else ():
             self._call(request)
-        for _ in range(REQUESTS_PER_TURN):
-            waiting = session.next_request(now_s)
-            if waiting is None:
-                break
-            self._call(waiting)
-            if self._loop.time() >= until_s:
-                break
+        self._work_off(until_s, now_s)
         for request in session.take_cancelled():
             if request in self._tasks:
                 self._tasks[request].cancel()
+        if self._timer is None:  # its time has come
+            session.handle_timer(now_s)
         self.flush()
         more = session.has_work
         if self.transport.is_closing():
@@ -159,6 +155,16 @@ class Connection(asyncio.BufferedProtocol):
         elif not self._half_closed:
             self.transport.resume_reading()
         return more
+
+    def _work_off(self, until_s: float, now_s: float) -> None:
+        for _ in range(REQUESTS_PER_TURN):
+            waiting = self.session.next_request()
+            if waiting is None:
+                return
+            if not self.session.perform(waiting, now_s):
+                self._call(waiting)
+            if self._loop.time() >= until_s:
+                return
 
     def flush(self) -> None:
         """Send what the session has to send, as far as the client reads."""
@@ -198,8 +204,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def _handle_timer(self) -> None:
         self._timer = None
-        self.session.handle_timer(self._loop.time())
-        self.flush()
+        self._request_turn()  # the updates of many clients are due at one instant
 
     # ---------------------------------------------------------------------------------------- methods
 

@@ -1,8 +1,8 @@
 """One client as the server sees it; sans-IO: bytes and times in, requests and bytes out.
 
 The way of a request: ``receive`` takes bytes, ``read`` turns some of them into requests and returns the
-urgent ones, ``next_request`` gives the others in order, and ``answer`` or ``fail`` ends each. Messages
-to the client wait for ``take_output``. While the client does not read (``writable`` is False)
+urgent ones, ``next_request`` gives the others in order, and ``perform``, ``answer`` or ``fail`` ends each.
+Messages to the client wait for ``take_output``. While the client does not read (``writable`` is False)
 requests wait, updates merge and notifications are dropped, but reading never stops: behind whatever waits
 there may be an emergency stop.
 """
@@ -282,16 +282,20 @@ class Session:
     def _may_start(self) -> bool:
         return len(self._running) < self._limits.running_requests and not self.congested
 
-    def next_request(self, now_s: float) -> Request | None:
-        """Return the next request to call, None while there is none or none may start."""
-        while self._waiting and self._may_start and self.end_reason is None:
-            request = self._waiting.popleft()
-            own = session_methods.HANDLERS.get(request.method.name)
-            if own is None:
-                self._running.add(request)
-                return request
+    def next_request(self) -> Request | None:
+        """Return the next request to ``perform`` or call, None while there is none or none may start."""
+        if not self._waiting or not self._may_start or self.end_reason is not None:
+            return None
+        request = self._waiting.popleft()
+        self._running.add(request)
+        return request
+
+    def perform(self, request: Request, now_s: float) -> bool:
+        """Perform and answer REQUEST if it is the session's own; return whether it was."""
+        own = session_methods.HANDLERS.get(request.method.name)
+        if own is not None:
             self._perform(request, own, now_s)
-        return None
+        return own is not None
 
     def take_cancelled(self) -> list[Request]:
         """Return the running requests that the client has cancelled meanwhile."""

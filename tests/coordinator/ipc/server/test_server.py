@@ -11,7 +11,8 @@ import pytest
 
 from coordinator.ipc.protocol.limits import Limits
 from coordinator.ipc.server.connection import UNREAD_BYTES
-from coordinator.ipc.server.fair_scheduler import TURN_S
+from coordinator.ipc.server.fair_scheduler import ROUND_S, TURN_S
+from coordinator.ipc.server.session import PHASES
 from tests.coordinator.ipc.served import (
     Script,
     Served,
@@ -132,6 +133,43 @@ def test_however_many_are_sent_at_once_what_is_answered_at_once_is_never_too_muc
             assert (answer.get("id"), "result" in answer) == (number, True), answer
 
     run(tmp_path, body, look_s=TURN_S)  # one request takes a whole turn
+
+
+def test_what_the_server_itself_answers_takes_turns_with_other_clients(tmp_path: Path) -> None:
+    """Failed before: all of them were answered in one turn."""
+
+    async def body(served: Served) -> None:
+        many, other = await served.script(client="many"), await served.script(client="other")
+        count = served.settings.limits.pending_requests // 2
+        for number in range(count):
+            many.send("api.ping", number)
+        many.send("machine.info", count)
+        other.send("machine.info")
+        assert "result" in await other.receive()
+        assert served.order == ["info"]
+        for number in range(count + 1):
+            assert (await many.receive())["id"] == number
+
+    run(tmp_path, body, look_s=TURN_S)  # one request takes a whole turn
+
+
+def test_updates_that_are_due_at_one_instant_do_not_fill_one_round(tmp_path: Path) -> None:
+    """Failed before: all were sent in one."""
+
+    async def body(served: Served) -> None:
+        scripts = [await served.script() for _ in range(8 * PHASES)]
+        for script in scripts:
+            await script.ask("api.watch", rate_hz=1.0)
+        sessions = [connection.session for connection in served.server._connections]
+        sent, most = 0, 0
+        served.state.set("x", 1)
+        while sent < len(scripts):
+            await asyncio.sleep(0)
+            now_sent = sum(session.counters.updates for session in sessions)
+            most, sent = max(most, now_sent - sent), now_sent
+        assert most <= ROUND_S / TURN_S + 1
+
+    run(tmp_path, body, look_s=TURN_S)  # one update takes a whole turn
 
 
 def test_of_a_client_that_waits_for_its_turn_no_more_than_a_bounded_part_is_taken_in(tmp_path: Path) -> None:
