@@ -102,7 +102,7 @@ class Connection(asyncio.BufferedProtocol):
     def resume_writing(self) -> None:
         """Go on."""
         self.session.writable = True
-        self._request_turn()
+        self._loop.call_soon(self._request_turn)  # asyncio would end twice what is closed in here
 
     def connection_lost(self, exc: Exception | None) -> None:
         """End everything that still runs for the client; a stop that waits for its turn is done."""

@@ -172,6 +172,29 @@ def test_updates_that_are_due_at_one_instant_do_not_fill_one_round(tmp_path: Pat
     run(tmp_path, body, look_s=TURN_S)  # one update takes a whole turn
 
 
+def test_a_client_that_has_said_all_and_reads_late_is_disconnected_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Failed before, with a traceback: asyncio must not be told to close while it tells that there is room."""
+
+    async def body(served: Served) -> None:
+        served.state.set("x", "y" * 400_000)  # more than the kernel takes at once
+        script = await served.script()
+        (connection,) = served.server._connections
+        script.send("state.get")
+        script.send("api.ping", 2)
+        script.writer.write_eof()
+        script.writer.transport.pause_reading()  # type: ignore[attr-defined]
+        while connection.session.writable:
+            await asyncio.sleep(0.1)
+        script.writer.transport.resume_reading()  # type: ignore[attr-defined]
+        assert [answer["id"] for answer in await script.rest()] == [1, 2]
+        await asyncio.sleep(0.1)
+
+    run(tmp_path, body)
+    assert not caplog.records
+
+
 def test_of_a_client_that_waits_for_its_turn_no_more_than_a_bounded_part_is_taken_in(tmp_path: Path) -> None:
     read_at_once = 256 * 1024  # by asyncio
     requests = [b'{"id":%d,"method":"machine.info"}%s\n' % (n, b" " * 8000) for n in range(200)]
