@@ -35,6 +35,7 @@ from coordinator.service.state.log_ring import Entry
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.loop_watchdog import WatchedLoop
 from coordinator.support.report import PlainReport, Report
+from coordinator.support.time_slice import shorten_time_slice
 from coordinator.support.values import Value
 from coordinator.support.version import VERSION
 from coordinator.tables.store import table_folder
@@ -103,6 +104,7 @@ def serve(
 ) -> Report:
     """Serve the machine that LOAD describes; raises as ``serve_machine``."""
     raise_files_limit()
+    shorten_time_slice()
     process = _ServiceProcess(load, options, cache)
     try:
         run_to_end(process.serve, WatchedLoop)

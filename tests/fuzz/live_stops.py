@@ -42,6 +42,7 @@ from yarl import URL
 
 from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.support.time_slice import shorten_time_slice
 from coordinator.web.stop_request import STOP_PATH
 from tests.fuzz.ipc_target import line
 from tests.fuzz.live import ROOT
@@ -164,6 +165,7 @@ class Machine:
         for task in Path(f"/proc/{self._process.pid}/task").iterdir():
             with contextlib.suppress(ProcessLookupError):
                 os.sched_setscheduler(int(task.name), policy, os.sched_param(0))
+                shorten_time_slice(thread=int(task.name))  # as before: the call before forgets it
 
     def begin(self) -> None:
         """Have it print with the fan on, unless it does already; lines that were typed are done first."""

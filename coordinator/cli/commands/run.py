@@ -21,6 +21,7 @@ from coordinator.support.examples import machine_name
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.progress import Progress, ProgressDisplay
 from coordinator.support.report import Report
+from coordinator.support.time_slice import shorten_time_slice
 from coordinator.tables.store import table_folder
 from nodes.dictionary.cache import DictionaryCache
 from nodes.support.option_values import UsageError, add_command, existing_file, options_from
@@ -138,6 +139,7 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
         )
         _announce(description)
         show = stack.enter_context(_progress(options, program))
+        shorten_time_slice()
         outcome = run_to_end(
             lambda: run_job(
                 description,

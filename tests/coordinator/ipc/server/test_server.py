@@ -175,7 +175,7 @@ def test_updates_that_are_due_at_one_instant_do_not_fill_one_round(tmp_path: Pat
 def test_a_client_that_has_said_all_and_reads_late_is_disconnected_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Failed before, with a traceback: asyncio must not be told to close while it tells that there is room."""
+    """Failed before, with a traceback: asyncio must not be told to close while it says that there is room."""
 
     async def body(served: Served) -> None:
         served.state.set("x", "y" * 400_000)  # more than the kernel takes at once
@@ -185,7 +185,7 @@ def test_a_client_that_has_said_all_and_reads_late_is_disconnected_once(
         script.send("api.ping", 2)
         script.writer.write_eof()
         script.writer.transport.pause_reading()  # type: ignore[attr-defined]
-        while connection.session.writable:
+        while connection.session.writable:  # noqa: ASYNC110 (it tells nobody)
             await asyncio.sleep(0.1)
         script.writer.transport.resume_reading()  # type: ignore[attr-defined]
         assert [answer["id"] for answer in await script.rest()] == [1, 2]
