@@ -8,8 +8,8 @@ import asyncio
 from collections.abc import Callable
 from typing import Final, Protocol
 
-ROUND_S: Final = 0.002
-TURN_S: Final = 0.0005
+ROUND_S: Final = 0.001
+TURN_S: Final = 0.00025
 RECEIVE_BYTES: Final = 65_536
 
 

@@ -5,6 +5,8 @@ import asyncio
 from coordinator.ipc.server.fair_scheduler import ROUND_S, TURN_S, FairScheduler
 
 TURNS_IN_A_ROUND = round(ROUND_S / TURN_S)
+ROUNDING_S = 1e-9
+"""More than the sums of times in s lose."""
 
 
 class Clock:
@@ -27,7 +29,7 @@ class Client:
 
     def work(self, until_s: float) -> bool:
         assert until_s == self._clock.now_s + TURN_S
-        self._clock.now_s = until_s
+        self._clock.now_s = until_s + ROUNDING_S
         self._worked.append(self.name)
         self.turns -= 1
         return self.turns > 0
