@@ -1,7 +1,7 @@
 """How long this process may compute before it is another one's turn, where several want a processor.
 
 Linux gives the processor first to whoever has the earliest deadline: the time slice after it became ready. So
-who asks for short slices is up sooner, and gets no more of the processor in all (sched(7), sched_setattr(2)).
+a thread with short slices runs sooner, with the same share of processor time (sched(7), sched_setattr(2)).
 """
 
 import ctypes
@@ -35,7 +35,7 @@ def shorten_time_slice(slice_ns: int = SLICE_NS, thread: int = 0) -> None:
     """Have THREAD (0: this one), and those that it begins from now on, ask for slices of SLICE_NS.
 
     Nothing happens on other computers than those of ``_CALLS``, nor where somebody has chosen another policy
-    than the usual one; Linux before 6.12 takes the wish and ignores it.
+    than the usual one; Linux before 6.12 accepts the request and ignores it.
     """
     set_number, _ = _numbers()
     attributes = slice_attributes(thread)

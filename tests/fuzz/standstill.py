@@ -43,8 +43,7 @@ class Standstills:
 
     def __exit__(self, *error: object) -> None:
         for process in self._watching:
-            found: list[Span] = json.loads(process.communicate()[0])
-            self.spans += map(tuple, found)  # type: ignore[arg-type]
+            self.spans += [(since, until) for since, until in json.loads(process.communicate()[0])]
 
 
 def stood_still_ms(spans: Sequence[Span], since_ns: int, until_ns: int) -> float:

@@ -35,13 +35,10 @@ LOOPBACK: Final = "127.0.0.1"
 class OpenService(HeldService):
     """On all ways in; whoever comes to FOLDER/open.sock may watch."""
 
+    own_process = True
     pty: PseudoTerminal | None = None
     ways: dict[str, Any]
     """Ports and links by their names."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
-        self.own_process = True
 
     @asynccontextmanager
     async def interfaces(self) -> AsyncIterator[None]:

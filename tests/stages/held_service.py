@@ -41,6 +41,9 @@ PATIENCE_S = 60.0
 class HeldService:
     """SERVICE with its interfaces in FOLDER; what tests do is done in another thread than its loop's."""
 
+    own_process = False
+    """Whether nothing else is in this process."""
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.socket, self.klippy_socket = folder / "api.sock", folder / "klippy.sock"
@@ -51,8 +54,6 @@ class HeldService:
         self.stop_path: StopPath
         self.terminal = -1
         """Where a user types, if it is the service's own."""
-        self.own_process = False
-        """Whether nothing else is in this process."""
 
     @property
     def fan_turns(self) -> bool:

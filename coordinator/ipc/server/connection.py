@@ -144,7 +144,7 @@ class Connection(asyncio.BufferedProtocol):
         for request in session.take_cancelled():
             if request in self._tasks:
                 self._tasks[request].cancel()
-        if self._timer is None:  # its time has come
+        if self._timer is None:  # it has fired, or there was none
             session.handle_timer(now_s)
         self.flush()
         more = session.has_work
