@@ -2,7 +2,7 @@
 
 What costs time (the job's g-code, planning, step generation) runs in one worker thread
 (``motion_worker.py``), cycle by cycle; the loop only hands finished batches to the links. The next cycle
-comes when there may be something to do: after CYCLE_S, after FULL_CYCLE_S while everything is made as far
+comes when there may be something to do: after CYCLE_S, within FULL_CYCLE_S while everything is made as far
 ahead as it may be, after REST_CYCLE_S while the machine has nothing to do; or at once, by ``call``.
 """
 
@@ -20,11 +20,14 @@ from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.standstill import StandstillTask
 from coordinator.streaming.timed_events import Due, DueEvents
 from coordinator.streaming.worker import SEND_AHEAD_S, START_LEAD_S, Cycle, MotionWorker
+from nodes.support.awake import call_between
 from nodes.support.errors import CanductorError
 
 CYCLE_S: Final = 0.05
-FULL_CYCLE_S: Final = 0.5
+FULL_CYCLE_S: Final = 0.6
 """While planner and commands reach as far ahead as they may; taken off the lead of SEND_AHEAD_S."""
+FULL_EARLY_S: Final = 0.1
+"""So much earlier it comes when the loop is awake anyway, as for sensors, which report every 0.3 s."""
 BUSY_CYCLE_S: Final = 0.4
 """The same on a busy bus: that it cannot carry the plan has to be found in time."""
 REST_CYCLE_S: Final = 1.0
@@ -222,11 +225,12 @@ class Streamer:
         ends_s = loop.time() + pause_s
         if pause_s == REST_CYCLE_S:  # together with the timers of modules
             ends_s = math.floor(ends_s / pause_s) * pause_s
-        timer = loop.call_at(ends_s, self._end_pause)
+        early_s = FULL_EARLY_S if pause_s == FULL_CYCLE_S else 0.0
+        cancel = call_between(ends_s - early_s, ends_s, self._end_pause)
         try:
             await self._pause
         finally:
-            timer.cancel()
+            cancel()
             self._pause = None
         self._rested = pause_s == REST_CYCLE_S and not self._called and self._at_rest()
 

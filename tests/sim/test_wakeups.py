@@ -6,7 +6,7 @@ from pathlib import Path
 from coordinator.modules.heaters.sections import HeaterBed
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
-from coordinator.streaming.streamer import FULL_CYCLE_S, REST_CYCLE_S
+from coordinator.streaming.streamer import FULL_CYCLE_S, FULL_EARLY_S, REST_CYCLE_S
 from coordinator.streaming.worker import SEND_AHEAD_S
 from nodes.devices.analog_in import REPORT_S
 from nodes.node.node import PATIENCE_S, REST_PATIENCE_S
@@ -62,7 +62,7 @@ def test_nothing_is_polled(tmp_path: Path) -> None:
         assert lead_s is not None
         assert lead_s >= SEND_AHEAD_S - FULL_CYCLE_S - 0.01
         await asyncio.sleep(3.0)
-        assert motion.streamer.cycles - cycles <= 3.0 / FULL_CYCLE_S + 2
+        assert motion.streamer.cycles - cycles <= 3.0 / (FULL_CYCLE_S - FULL_EARLY_S) + 2
         await stage.until_job("done")
         await stage.check_positions()
 
