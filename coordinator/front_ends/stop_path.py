@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import signal
-import threading
 from collections.abc import Callable
 from typing import Final
 
@@ -27,13 +26,14 @@ class StopPath:
         service.find_unread_stop = self.lane.find
         self._service = service
         self._loop = asyncio.get_running_loop()
-        self._loop_thread = threading.get_ident()
         self._looked_for: Machine | None = None
         """The machine that ran when a look began: what is found in it does not concern a later one."""
         self._stopped: Machine | None = None
         self._watchdog: LoopWatchdog | None = None
         if isinstance(self._loop, WatchedLoop):
-            self._watchdog = LoopWatchdog(self._loop, self._report, self._while_held)
+            self._watchdog = LoopWatchdog(
+                self._loop, self._report, self._while_held, self.lane.news_fd, self._look_at_news
+            )
 
     def start(self) -> None:
         """Begin to watch; without effect on a loop that cannot be watched, such as a simulation's."""
@@ -47,11 +47,8 @@ class StopPath:
         self.lane.close()
 
     def _stop(self, who: str) -> None:
-        """Have WHO stop the machine; in the thread its nodes are stopped, and the loop enters the rest."""
-        if threading.get_ident() == self._loop_thread:
-            self._service.emergency_stop(who)
-        else:
-            self._stop_nodes(lambda: self._service.emergency_stop(who))
+        """Have WHO stop the machine: its nodes are stopped, and the loop enters the rest."""
+        self._stop_nodes(lambda: self._service.emergency_stop(who))
 
     def _stop_nodes(self, then: Callable[[], None]) -> None:
         """Stop the nodes of the machine, unless that was done; the loop calls THEN when it can."""
@@ -69,6 +66,10 @@ class StopPath:
         with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(machine.stop_as_announced)
         machine.stop_nodes()
+
+    def _look_at_news(self) -> None:
+        self._looked_for = self._service.machine
+        self.lane.look_at_news()
 
     def _while_held(self, is_held: Callable[[], bool]) -> None:
         self._looked_for = self._service.machine

@@ -2,7 +2,8 @@
 
 A callback that calculates, or waits for a disk, holds everything that lives on the loop. A timer of the
 kernel is set whenever the loop begins to work and disarmed when it rests, so that watching costs two short
-calls of the system for each rest, and wakes nobody while the loop is quick. It expires into a thread.
+calls of the system for each rest, and wakes nobody while the loop is quick. It expires into a thread, which
+attends to something else besides.
 """
 
 import asyncio
@@ -42,7 +43,7 @@ FRAMES_MAX: Final = 8
 STACKS_BYTES_MAX: Final = 1 << 20
 """faulthandler writes 100 calls of 100 threads at most."""
 _CLOCK_MONOTONIC: Final = 1
-_CLOSE_ON_EXEC: Final = os.O_CLOEXEC
+_TIMER_FLAGS: Final = os.O_CLOEXEC | os.O_NONBLOCK
 _SIGNALS_BYTES: Final = 65_536
 _STANDARD_ERROR: Final = 2
 _CALL: Final = re.compile(r'^  File "(.*)", line (\d+|\?\?\?) in (.*)$', re.MULTILINE)
@@ -62,8 +63,9 @@ class _Timer:
 
     def __init__(self, first_s: float, again_s: float) -> None:
         self._libc: Any = ctypes.PyDLL(None, use_errno=True)
-        self._fd: int = self._libc.timerfd_create(_CLOCK_MONOTONIC, _CLOSE_ON_EXEC)
-        if self._fd < 0:
+        self.fd: int = self._libc.timerfd_create(_CLOCK_MONOTONIC, _TIMER_FLAGS)
+        """Readable when ``has_expired``."""
+        if self.fd < 0:
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number))
         self._armed = ctypes.byref(_Times(0, round(again_s * 1e9), 0, round(first_s * 1e9)))
@@ -71,19 +73,22 @@ class _Timer:
 
     def arm(self) -> None:
         """Begin, from now on."""
-        self._libc.timerfd_settime(self._fd, 0, self._armed, None)
+        self._libc.timerfd_settime(self.fd, 0, self._armed, None)
 
     def disarm(self) -> None:
         """Expire no more."""
-        self._libc.timerfd_settime(self._fd, 0, self._at_rest, None)
+        self._libc.timerfd_settime(self.fd, 0, self._at_rest, None)
 
-    def wait(self) -> None:
-        """Wait until it expires."""
-        os.read(self._fd, 8)
+    def has_expired(self) -> bool:
+        """Return whether it has expired since this was called last, or since it was set."""
+        try:
+            return bool(os.read(self.fd, 8))
+        except BlockingIOError:
+            return False
 
     def close(self) -> None:
         """Let go of it."""
-        fd, self._fd = self._fd, -1
+        fd, self.fd = self.fd, -1
         if fd >= 0:
             os.close(fd)
 
@@ -206,7 +211,8 @@ class LoopWatchdog:
     """Watches LOOP from ``start`` to ``close``, both on it.
 
     REPORT gets a sentence when something held the loop, on the loop; WHILE_HELD is called in the watchdog's
-    thread again and again while something does; its argument returns whether that is still so.
+    thread again and again while something does; its argument returns whether that is still so. ATTEND is
+    called in this thread whenever the descriptor NEWS_FD is readable, whatever the loop does.
     """
 
     def __init__(
@@ -214,10 +220,14 @@ class LoopWatchdog:
         loop: WatchedLoop,
         report: Callable[[str], None],
         while_held: Callable[[Callable[[], bool]], None],
+        news_fd: int,
+        attend: Callable[[], None],
     ) -> None:
         self._loop = loop
         self._report = report
         self._while_held = while_held
+        self._news_fd = news_fd
+        self._attend = attend
         self._selector = loop.watched
         self._loop_thread = threading.get_ident()
         self._thread = threading.Thread(target=self._run, name="loop watchdog", daemon=True)
@@ -227,7 +237,7 @@ class LoopWatchdog:
         self._left_out = 0
         self._seen_s = 0.0
         self._stuck_s = 0.0
-        self._failed_s = 0.0
+        self._failed_s = -REPORT_EVERY_S
         self._stacks = _Stacks()
         self._cpu_clock = time.pthread_getcpuclockid(self._loop_thread)
         self._first = (0.0, 0.0, 0.0)
@@ -247,20 +257,27 @@ class LoopWatchdog:
         sys.setswitchinterval(self._usual_switch_s)
 
     def _run(self) -> None:
+        poll = select.poll()
+        for fd in (self._news_fd, self._selector.timer.fd):
+            poll.register(fd, select.POLLIN)
         while True:
-            self._selector.timer.wait()
+            ready = [fd for fd, _ in poll.poll()]
             if self._closing:
                 return
-            since_s = self._selector.busy_since_s
-            if not since_s:
-                continue
             try:
-                self._while_held(functools.partial(self._is_held, since_s))
-                self._look(since_s)
+                if self._news_fd in ready:
+                    self._attend()
+                if self._selector.timer.has_expired() and (since_s := self._selector.busy_since_s):
+                    self._while_held(functools.partial(self._is_held, since_s))
+                    self._look(since_s)
             except Exception:  # noqa: BLE001 (it has to go on: it may be what stops the machine)
-                if self._failed_s != since_s:  # once for each hold
-                    _say(traceback.format_exc())
-                self._failed_s = since_s
+                self._say_failure()
+
+    def _say_failure(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._failed_s >= REPORT_EVERY_S:
+            self._failed_s = now_s
+            _say(traceback.format_exc())
 
     def _is_held(self, since_s: float) -> bool:
         return self._selector.busy_since_s == since_s

@@ -1,13 +1,15 @@
 """Accepts connections, and has the stop lane watch each of them from then on.
 
 asyncio's servers accept a connection several iterations of the loop before its protocol exists. An emergency
-stop on it would wait for the loop if that were held in between. While the loop is held, the stop lane's
-thread accepts connections here (docs/adr/0016-stop-path.md).
+stop on it would wait for all of them. Here the loop or the stop lane's thread accepts it, whoever is first
+(docs/adr/0016-stop-path.md).
 """
 
 import asyncio
+import contextlib
 import socket
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -19,10 +21,8 @@ ACCEPTS_PER_ROUND: Final = 8
 """Connections taken before the rest of the loop gets its turn."""
 RETRY_S: Final = 0.2
 """After the system had no file left for a connection."""
-LOOKS: Final = 6
-"""Rounds of the loop, all of them busy ones maybe, until a connection has its protocol and is read."""
-HELD_MAX: Final = 64
-"""Connections that are accepted while the loop is held; others wait for the loop."""
+AHEAD_MAX: Final = 64
+"""Connections that are accepted before the loop serves them; others wait for the loop."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +53,7 @@ class Acceptor:
         self._loop = asyncio.get_running_loop()
         self._retry: asyncio.TimerHandle | None = None
         self._lock = threading.Lock()
-        self._held: list[Arrival] = []
+        self._ahead: deque[Arrival] = deque()
         """Accepted by the lane's thread, and not served yet."""
         self._closed = False
         self.starved = 0
@@ -65,20 +65,20 @@ class Acceptor:
             listener.close()
             raise
         self._loop.add_reader(listener, self._accept)
-        lane.listen(self, self._accept_while_held)
+        lane.listen(listener, self._accept_ahead)
 
     def close(self) -> None:
         """Stop accepting; connections that are served stay open."""
-        self._lane.forget(self)
+        self._lane.listen_no_more(self._listener)
         self._loop.remove_reader(self._listener)
         if self._retry is not None:
             self._retry.cancel()
         with self._lock:
             self._closed = True
             self._listener.close()
-            for arrival in self._held:
+            for arrival in self._ahead:
                 self._give_up(arrival)
-            self._held.clear()
+            self._ahead.clear()
 
     # ---- On the loop ----
 
@@ -94,23 +94,18 @@ class Acceptor:
                 self._retry = self._loop.call_later(RETRY_S, self._accept_again)
                 return
             arrival.serve()
-            self._look_at(arrival, LOOKS)
-
-    def _look_at(self, arrival: Arrival, looks: int) -> None:
-        """Look for a stop in each round until somebody reads the connection: its turn may be far off."""
-        if self._lane.look_at_new(arrival.opened) and looks > 1:
-            self._loop.call_soon(self._look_at, arrival, looks - 1)
 
     def _accept_again(self) -> None:
         self._loop.add_reader(self._listener, self._accept)
 
-    def _serve(self, arrival: Arrival) -> None:
-        """Serve ARRIVAL, which the lane's thread has accepted."""
+    def _serve_ahead(self) -> None:
+        """Serve some of those whom the lane's thread has accepted; the others in the next round."""
         with self._lock:
-            if arrival not in self._held:
-                return  # it was given up
-            self._held.remove(arrival)
-        arrival.serve()
+            served = [self._ahead.popleft() for _ in range(min(len(self._ahead), ACCEPTS_PER_ROUND))]
+            if self._ahead:
+                self._loop.call_soon(self._serve_ahead)
+        for arrival in served:
+            arrival.serve()
 
     # ---- In both threads ----
 
@@ -131,16 +126,21 @@ class Acceptor:
 
     # ---- In the lane's thread ----
 
-    def _accept_while_held(self) -> None:
-        with self._lock:
-            while not self._closed and len(self._held) < HELD_MAX:
-                try:
-                    arrival = self._take()
-                except OSError:
-                    return
-                try:
-                    self._loop.call_soon_threadsafe(self._serve, arrival)
-                except RuntimeError:  # the loop has ended
-                    self._give_up(arrival)
-                else:
-                    self._held.append(arrival)
+    def _accept_ahead(self) -> None:
+        while self._take_ahead():
+            pass
+
+    def _take_ahead(self) -> bool:
+        """Have the loop serve one who has come; return whether there was one, and room."""
+        with self._lock:  # of one at a time: the loop waits for it
+            if self._closed or len(self._ahead) >= AHEAD_MAX:
+                return False
+            try:
+                arrival = self._take()
+            except OSError:
+                return False
+            self._ahead.append(arrival)
+            if len(self._ahead) == 1:
+                with contextlib.suppress(RuntimeError):  # the loop has ended: ``close`` gives it up
+                    self._loop.call_soon_threadsafe(self._serve_ahead)
+            return True

@@ -2,14 +2,15 @@
 
 While the loop is held, a thread (support/loop_watchdog.py) looks at what clients have sent without taking
 it, and stops the nodes when there is a stop from one who may stop them. The loop reads the same bytes when it
-can, and answers them: that changes nothing any more. Connections are accepted meanwhile, too (acceptor.py),
-because ``canductor estop`` comes with a new one.
+can, and answers them: that changes nothing any more. ``canductor estop`` comes with a new connection, which
+takes the loop several rounds: who comes is let in (acceptor.py) and looked at by the thread at any time.
 """
 
 import asyncio
 import contextlib
 import functools
 import os
+import select
 import socket
 import threading
 from asyncio.trsock import TransportSocket
@@ -31,6 +32,10 @@ class EncryptedTransport(asyncio.Transport):
 
 
 def _ignore(_: str) -> None:
+    pass
+
+
+def _nothing() -> None:
     pass
 
 
@@ -56,7 +61,12 @@ class StopLane:
         """Of connections without a protocol."""
         self._peeking: dict[Hashable, socket.socket] = {}
         self._others: dict[Finder, Finder] = {}
-        self._accepting: dict[Hashable, Callable[[], None]] = {}
+        self._accepting: dict[socket.socket, Callable[[], object]] = {}
+        self._news = select.epoll()
+        """Has what is new and what accepts it, by descriptor; says once that something has come there."""
+        self._at_news: dict[int, Callable[[], object]] = {}
+        self.news_fd: Final = self._news.fileno()
+        """Readable when ``look_at_news`` has something to do."""
 
     @contextlib.contextmanager
     def _turn(self) -> Iterator[None]:
@@ -93,25 +103,35 @@ class StopLane:
         with self._turn():
             self._unread[key] = find
             for new in [new for new in self._new if new.fileno() == opened.fileno()]:
-                del self._new[new]
+                self._settle(new)
 
     def forget(self, key: Hashable) -> None:
-        """Look at it no more, or listen there no more; without effect for an unknown KEY."""
+        """Look at it no more; without effect for an unknown KEY."""
         with self._turn():
             self._unread.pop(key, None)
-            self._accepting.pop(key, None)
             if (own := self._peeking.pop(key, None)) is not None:
                 own.close()
 
     def settle(self, opened: socket.socket) -> None:
         """Look no more at OPENED as a new connection: it has its protocol, or was given up."""
         with self._turn():
-            self._new.pop(opened, None)
+            self._settle(opened)
 
-    def listen(self, key: Hashable, accept: Callable[[], None]) -> None:
-        """Call ACCEPT at each look, until ``forget`` of KEY: it takes new connections."""
+    def _settle(self, opened: socket.socket) -> None:
+        if self._new.pop(opened, None) is not None:
+            self._expect_no_news(opened)
+
+    def listen(self, listener: socket.socket, accept: Callable[[], object]) -> None:
+        """Call ACCEPT when somebody comes to LISTENER and at each look, until ``listen_no_more``."""
         with self._turn():
-            self._accepting[key] = accept
+            self._accepting[listener] = accept
+            self._expect_news(listener, accept)
+
+    def listen_no_more(self, listener: socket.socket) -> None:
+        """End that; LISTENER may be closed then."""
+        with self._turn():
+            if self._accepting.pop(listener, None) is not None:
+                self._expect_no_news(listener)
 
     def look_also(self, find: Finder) -> None:
         """Ask FIND as well: it looks where there is no socket."""
@@ -123,20 +143,13 @@ class StopLane:
         with self._turn():
             for own in self._peeking.values():
                 own.close()
+            self._news.close()
+            self._at_news.clear()
             self._unread.clear()
             self._new.clear()
             self._peeking.clear()
             self._accepting.clear()
             self._others.clear()
-
-    def look_at_new(self, opened: socket.socket) -> bool:
-        """Look at OPENED, just accepted; return whether to look again: it is new still, and stops nothing."""
-        with self._turn():
-            find = self._new.get(opened)
-            who = None if find is None else find()
-        if who is not None:
-            self._stop(who)
-        return find is not None and who is None
 
     def find(self) -> str | None:
         """Return who stops the machine with what is unread; None: nobody. Stops nothing."""
@@ -152,8 +165,44 @@ class StopLane:
         """Ask FIND about OPENED, just accepted, until it is watched under a key, or ``settle`` of it."""
         with self._turn():
             self._new[opened] = find
+            self._expect_news(opened, functools.partial(self._look_at_new, opened))
+
+    def _expect_news(self, opened: socket.socket, call: Callable[[], object]) -> None:
+        """Have ``look_at_news`` CALL when something comes at OPENED; at once if it has come."""
+        if self._news.closed:
+            return
+        with contextlib.suppress(OSError):  # without room for it, it waits until the loop is held
+            self._news.register(opened, select.EPOLLIN | select.EPOLLET)
+            self._at_news[opened.fileno()] = call
+
+    def _expect_no_news(self, opened: socket.socket) -> None:
+        if opened.fileno() >= 0 and not self._news.closed:  # a closed one is out already
+            self._at_news.pop(opened.fileno(), None)
+            with contextlib.suppress(FileNotFoundError):
+                self._news.unregister(opened)
 
     # ---- In the lane's thread ----
+
+    def look_at_news(self) -> None:
+        """Let in who has come, and look at what they have sent since they were looked at last.
+
+        A failure hides no stop found elsewhere, and is raised at the end.
+        """
+        failures: list[Exception] = []
+        for fd, _ in self._news.poll(0):
+            try:
+                self._at_news.get(fd, _nothing)()
+            except Exception as error:  # noqa: BLE001 (as above)
+                failures.append(error)
+        if failures:
+            raise failures[0]
+
+    def _look_at_new(self, opened: socket.socket) -> None:
+        with self._turn():
+            find = self._new.get(opened)
+            who = None if find is None else find()
+        if who is not None:
+            self._stop(who)
 
     def look(self, is_held: Callable[[], bool] = _to_the_end) -> None:
         """Look at everything once, while IS_HELD says that the loop does not read it itself.

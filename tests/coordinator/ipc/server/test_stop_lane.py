@@ -3,6 +3,7 @@
 import asyncio
 import functools
 import json
+import select
 import socket
 import ssl
 import threading
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 
 from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.acceptor import AHEAD_MAX
 from coordinator.ipc.server.fair_scheduler import ROUND_S, FairScheduler
 from coordinator.ipc.server.settings import TcpSettings
 from coordinator.ipc.server.stop_lane import StopLane
@@ -45,21 +47,7 @@ class Lane(StopLane):
 
     def __init__(self) -> None:
         self.stops: list[str] = []
-        """Found by ``look``."""
-        self.early: list[str] = []
-        """Found on new connections by the loop."""
-        self._found = self.early
-        super().__init__(self._note)
-
-    def _note(self, who: str) -> None:
-        self._found.append(who)
-
-    def look(self, is_held: Callable[[], bool] = lambda: True) -> None:
-        self._found = self.stops
-        try:
-            super().look(is_held)
-        finally:
-            self._found = self.early
+        super().__init__(self.stops.append)
 
     def seen(self) -> list[str]:
         """Look once, as the watchdog's thread does; return who stopped the machine by then."""
@@ -396,6 +384,69 @@ def test_a_new_connection_over_tcp_that_the_loop_has_begun_to_take(
     run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, chosen))
 
 
+@TLS
+def test_who_comes_is_attended_to_at_once(
+    tmp_path: Path, certificate: tuple[Path, Path], *, secret: bool
+) -> None:
+    """By the thread, while nothing holds the loop: a stop waited for some rounds of it, more with TLS."""
+    lane, chosen = Lane(), certificate if secret else None
+    hello = line({**HELLO, "params": {"version": 1, "token": TOKENS[Scope.OPERATE]}})
+
+    def news() -> bool:
+        return bool(select.select([lane.news_fd], [], [], 0.0)[0])
+
+    def attend() -> None:
+        assert select.select([lane.news_fd], [], [], PATIENCE_S)[0]
+        lane.look_at_news()
+
+    async def go(served: Served) -> None:
+        dialled = Dialled(served.server.tcp_port or 0, chosen)
+        while not dialled.shake_hands():
+            attend()
+        dialled.send(hello)
+        while news():
+            lane.look_at_news()
+        assert lane.stops == []
+        dialled.send(line(STOP))
+        while not lane.stops:
+            attend()
+        assert lane.stops == ["me"]
+        assert not news(), "it is said once"
+        assert served.stops == []
+        await lane.is_unread_until_done(served.stops)
+        dialled.send(line({"id": 3, "method": "machine.info"}))
+        answers = b""
+        async with asyncio.timeout(PATIENCE_S):
+            while b'"id":3' not in answers.replace(b" ", b""):
+                await asyncio.sleep(0.01)
+                answers += dialled.receive()
+        assert not news(), "the loop reads it now"
+        dialled.close()
+        await served.server_has(0)
+
+    run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, chosen))
+
+
+def test_many_who_come_at_once_are_all_served(tmp_path: Path) -> None:
+    """Those that the thread has accepted, some in each round of the loop, and those beyond."""
+    lane = Lane()
+
+    async def go(served: Served) -> None:
+        come = [socket.socket(socket.AF_UNIX) for _ in range(AHEAD_MAX + 20)]
+        for opened in come:
+            opened.connect(served.at)
+            opened.sendall(line(HELLO))
+            lane.look_at_news()
+        for opened in come:
+            opened.setblocking(False)
+            async with asyncio.timeout(PATIENCE_S):
+                assert b"result" in await asyncio.get_running_loop().sock_recv(opened, 10_000)
+            opened.close()
+        assert lane._new == {}, "all have their protocols"
+
+    run(tmp_path, go, stop_lane=lane)
+
+
 def test_a_look_that_fails_hides_no_stop() -> None:
     """Failed before: the first failure ended the look, and each further one of the hold."""
     lane = Lane()
@@ -403,12 +454,13 @@ def test_a_look_that_fails_hides_no_stop() -> None:
     def fail() -> str:
         raise OSError("closed")
 
-    lane.listen("a socket", fail)  # type: ignore[arg-type]
-    lane.look_also(fail)
-    lane.look_also(lambda: "me")
-    with pytest.raises(OSError, match="closed"):
-        lane.look()
-    assert lane.stops == ["me"]
+    with socket.socket(socket.AF_UNIX) as listener:
+        lane.listen(listener, fail)
+        lane.look_also(fail)
+        lane.look_also(lambda: "me")
+        with pytest.raises(OSError, match="closed"):
+            lane.look()
+        assert lane.stops == ["me"]
 
 
 def test_a_look_ends_when_the_loop_goes_on() -> None:
