@@ -15,10 +15,13 @@ and program; its Python is --peer-python. The peer is not a part of this project
 figures of PEER_FIGURES are printed. Three nodes are measured with ours only: the peer cannot reach a virtual
 CAN bus.
 
+With --limit the hosts run in a control group of 15 % of one core and 200 MB (as root), as beside other
+programs on a small computer.
+
 The first line says how fast the computer is: a host that is woken some ten times a second does little, but
 finds nothing of what it needs in the caches.
 
-Usage: python bench/realtime.py [--seconds S] [--only STATE ...] [--peer PATH [--peer-python PATH]]
+Usage: python bench/realtime.py [--seconds S] [--only STATE ...] [--limit] [--peer PATH [--peer-python PATH]]
 """
 
 import argparse
@@ -38,6 +41,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from control_group import ControlGroup, limited
 
 from coordinator.assembly.load import load_machine
 from coordinator.ipc.client.blocking import BlockingClient
@@ -63,6 +68,8 @@ WATCHED_S = 0.25
 """Between two queries of all clients together."""
 PEER_FIGURES = "waiting 0.3 %, printing 0.8 % of a core, 34 MB resident"
 """One node, the same file; measured on another computer beside e013306, which took 2 %, 2.7 %, 59 MB."""
+LIMIT_CORE_SHARE = 0.15
+LIMIT_BYTES = 200_000_000
 LOOP_ROUNDS = 10_000_000
 SCATTERED = 4096
 """Numbers that are added, each in a line of the caches of its own."""
@@ -401,9 +408,18 @@ def peers(python: str, peer: Path, config: Path, api: Path) -> list[str]:
 def play(config: Path, title: str, command: Any, chosen: argparse.Namespace) -> None:
     """Measure the host of COMMAND on the machine of CONFIG."""
     print(title, flush=True)
-    with tempfile.TemporaryDirectory() as name, machine(config, Path(name)) as played:
-        api = Path(name) / "api.sock"
-        run_states(command(played, api), api, Path(name), chosen)
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        played = stack.enter_context(machine(config, folder))
+        api = folder / "api.sock"
+        hosted = command(played, api)
+        group: ControlGroup | None = None
+        if chosen.limit:
+            group = stack.enter_context(limited(LIMIT_CORE_SHARE, LIMIT_BYTES))
+            hosted = group.running(hosted)
+        run_states(hosted, api, folder, chosen)
+        if group is not None:
+            print(f"             it was held back in {group.throttled} periods of 100 ms, start included")
 
 
 def main() -> None:
@@ -414,6 +430,7 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="+", choices=(1, 3), default=[1, 3])
     parser.add_argument("--clients", type=int, default=1, help="that watch a print")
     parser.add_argument("--threads", action="store_true", help="print each thread, too")
+    parser.add_argument("--limit", action="store_true", help="15 %% of one core and 200 MB; as root")
     parser.add_argument("--peer", type=Path, help="klippy.py of the peer")
     parser.add_argument(
         "--peer-python", default=sys.executable, help="the Python that has what the peer needs"
