@@ -196,10 +196,13 @@ def judge(mutant: Mutant) -> Verdict:
 
 def passes_unchanged(mutants: Sequence[Mutant]) -> bool:
     """Whether the project itself passes all that MUTANTS name; prints what fails."""
-    scenarios = tuple(dict.fromkeys(s for mutant in mutants for s in mutant.scenarios))
+    seeds_of: dict[str, int] = {}
+    for mutant in mutants:
+        for scenario in mutant.scenarios:
+            seeds_of[scenario] = max(mutant.seeds, seeds_of.get(scenario, 0))
     tests = tuple(dict.fromkeys(t for mutant in mutants for t in mutant.tests))
-    if scenarios:
-        seeds = max(mutant.seeds for mutant in mutants if mutant.scenarios)
+    for seeds in sorted(set(seeds_of.values())):
+        scenarios = tuple(scenario for scenario, most in seeds_of.items() if most == seeds)
         done = simulate(ROOT, scenarios, seeds)
         if done.returncode or " 0 failed" not in done.stdout:
             print(f"the project itself fails: {done.stdout[-1500:]}{done.stderr[-1500:]}")
