@@ -17,8 +17,6 @@ from typing import Final
 from coordinator.ipc.server.stop_lane import Finder, StopLane
 
 BACKLOG: Final = 128
-ACCEPTS_PER_ROUND: Final = 8
-"""Connections taken before the rest of the loop gets its turn."""
 RETRY_S: Final = 0.2
 """After the system had no file left for a connection."""
 AHEAD_MAX: Final = 64
@@ -83,29 +81,30 @@ class Acceptor:
     # ---- On the loop ----
 
     def _accept(self) -> None:
-        for _ in range(ACCEPTS_PER_ROUND):
-            try:
-                arrival = self._take()
-            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
-                return
-            except OSError:  # no file or memory for it: others may free some
-                self.starved += 1
-                self._loop.remove_reader(self._listener)
-                self._retry = self._loop.call_later(RETRY_S, self._accept_again)
-                return
-            arrival.serve()
+        """Take one: it costs a round of the loop as much as some requests do, and there may be thousands."""
+        try:
+            arrival = self._take()
+        except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+            return
+        except OSError:  # no file or memory for it: others may free some
+            self.starved += 1
+            self._loop.remove_reader(self._listener)
+            self._retry = self._loop.call_later(RETRY_S, self._accept_again)
+            return
+        arrival.serve()
 
     def _accept_again(self) -> None:
         self._loop.add_reader(self._listener, self._accept)
 
     def _serve_ahead(self) -> None:
-        """Serve some of those whom the lane's thread has accepted; the others in the next round."""
+        """Serve one of those whom the lane's thread has accepted; the next one in the next round."""
         with self._lock:
-            served = [self._ahead.popleft() for _ in range(min(len(self._ahead), ACCEPTS_PER_ROUND))]
+            if not self._ahead:
+                return  # they were given up
+            arrival = self._ahead.popleft()
             if self._ahead:
                 self._loop.call_soon(self._serve_ahead)
-        for arrival in served:
-            arrival.serve()
+        arrival.serve()
 
     # ---- In both threads ----
 

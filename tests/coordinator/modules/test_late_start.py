@@ -9,8 +9,9 @@ from nodes.devices.ticks import start_clock
 from nodes.node.node import Node
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 
-STALL_S = 0.7
-"""Longer than what begins is ahead of the last answer to get_clock, and shorter than a link's patience."""
+STALL_S = 0.9
+"""Longer than what begins is ahead of the last answer to get_clock (half a second, and a sensor's period at
+most), and shorter than a link's patience."""
 
 
 def ready_at_ns(folder: Path, monkeypatch: pytest.MonkeyPatch) -> int:
