@@ -1,8 +1,7 @@
-"""Programs that connect and leave as fast as they can, at each way in, beside a print: what is left of it.
+"""Connection floods at each socket during a print: rates, delays of other clients, the smallest lead.
 
-The demo's machine prints as a service. Each time two programs storm one socket: connect, send a first message
-of nobody who is known there, leave. Printed: connections a second, how long a client waits for its answer
-meanwhile, and the smallest lead of the motion. Exit status 1: the print did not go on.
+The demo's machine prints as a service. Two programs flood one socket after the other: they connect, send a
+first message with an unknown token, and disconnect. Exit status 1: the print was stopped.
 """
 
 import contextlib
@@ -24,11 +23,11 @@ from pathlib import Path
 from coordinator.ipc.client.blocking import BlockingClient
 
 ROOT = Path(__file__).resolve().parents[1]
-STORMERS = 2
-STORM_S = 12.0
+FLOODERS = 2
+FLOOD_S = 12.0
 ASK_S = 0.05
 START_S = 60.0
-HELLO = b'{"id":1,"method":"api.hello","params":{"version":1,"client":"storm","token":"nobody"}}\n'
+HELLO = b'{"id":1,"method":"api.hello","params":{"version":1,"client":"flood","token":"nobody"}}\n'
 REQUEST = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
 JOB = "G28\nG90\nG1 Z0.3 F600\n" + "".join(
     f"G1 X{20 + number * 37 % 60} Y{20 + number * 53 % 60} F9000\n" for number in range(4000)
@@ -42,7 +41,7 @@ def free_port() -> int:
         return int(opened.getsockname()[1])
 
 
-def storm(address: str | int, data: bytes, secret: bool, over: Event, count: "Synchronized[int]") -> None:
+def flood(address: str | int, data: bytes, secret: bool, over: Event, count: "Synchronized[int]") -> None:
     """Connect to ADDRESS, a path or a port, send DATA, leave, until OVER; add to COUNT how often."""
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     tls.check_hostname, tls.verify_mode = False, ssl.CERT_NONE
@@ -65,27 +64,27 @@ def storm(address: str | int, data: bytes, secret: bool, over: Event, count: "Sy
 
 
 def measure(client: BlockingClient, name: str, address: str | int, data: bytes, *, secret: bool) -> bool:
-    """Print what a storm does to CLIENT and the print; return whether that goes on."""
+    """Print what a flood does to CLIENT and the print; return whether that goes on."""
     over, count = multiprocessing.Event(), multiprocessing.Value("i", 0)
-    stormers = [
-        multiprocessing.Process(target=storm, args=(address, data, secret, over, count))
-        for _ in range(STORMERS)
+    flooders = [
+        multiprocessing.Process(target=flood, args=(address, data, secret, over, count))
+        for _ in range(FLOODERS)
     ]
-    for stormer in stormers:
-        stormer.start()
+    for flooder in flooders:
+        flooder.start()
     waited_ms = []
-    until_s = time.monotonic() + STORM_S
+    until_s = time.monotonic() + FLOOD_S
     while time.monotonic() < until_s:
         before_s = time.perf_counter()
         client.call("machine.state")
         waited_ms.append((time.perf_counter() - before_s) * 1e3)
         time.sleep(ASK_S)
     over.set()
-    for stormer in stormers:
-        stormer.join()
+    for flooder in flooders:
+        flooder.join()
     values = client.call("state.get", {"fields": ["machine.lead_min_ms", "job.state"]})["values"]
     print(
-        f"{name:<22} {count.value / STORM_S:6.0f} connections/s; an answer takes"
+        f"{name:<22} {count.value / FLOOD_S:6.0f} connections/s; an answer takes"
         f" {statistics.median(waited_ms):.1f} ms, worst {max(waited_ms):.1f} ms (n {len(waited_ms)});"
         f" {values['job.state']}, smallest lead so far {values['machine.lead_min_ms']} ms",
         flush=True,
@@ -123,7 +122,7 @@ def wait_for(true: Callable[[], bool], what: str) -> None:
 def make_certificate(folder: Path) -> list[str]:
     """Make a certificate and its key in FOLDER; return the options that give them to a service."""
     key, certificate = str(folder / "key.pem"), str(folder / "certificate.pem")
-    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=storm"]
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=flood"]
     subprocess.run([*command, "-keyout", key, "-out", certificate], check=True, capture_output=True)
     return ["--tls-certificate", certificate, "--tls-key", key]
 

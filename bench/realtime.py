@@ -15,8 +15,7 @@ and program; its Python is --peer-python. The peer is not a part of this project
 figures of PEER_FIGURES are printed. Three nodes are measured with ours only: the peer cannot reach a virtual
 CAN bus.
 
-With --limit the hosts run in a control group of 15 % of one core and 200 MB (as root), as beside other
-programs on a small computer.
+With --limit the hosts run in a control group of 15 % of one core and 200 MB (as root).
 
 The first line says how fast the computer is: a host that is woken some ten times a second does little, but
 finds nothing of what it needs in the caches.

@@ -32,7 +32,7 @@ class StopPath:
         self._watchdog: LoopWatchdog | None = None
         if isinstance(self._loop, WatchedLoop):
             self._watchdog = LoopWatchdog(
-                self._loop, self._report, self._while_held, self.lane.news_fd, self._look_at_news
+                self._loop, self._report, self._while_held, self.lane.events_fd, self._handle_events
             )
 
     def start(self) -> None:
@@ -67,9 +67,9 @@ class StopPath:
             self._loop.call_soon_threadsafe(machine.stop_as_announced)
         machine.stop_nodes()
 
-    def _look_at_news(self) -> None:
+    def _handle_events(self) -> None:
         self._looked_for = self._service.machine
-        self.lane.look_at_news()
+        self.lane.handle_events()
 
     def _while_held(self, is_held: Callable[[], bool]) -> None:
         self._looked_for = self._service.machine

@@ -3,7 +3,7 @@
 A callback that calculates, or waits for a disk, holds everything that lives on the loop. A timer of the
 kernel is set whenever the loop begins to work and disarmed when it rests, so that watching costs two short
 calls of the system for each rest, and wakes nobody while the loop is quick. It expires into a thread, which
-attends to something else besides.
+also handles the events of one more descriptor.
 """
 
 import asyncio
@@ -211,8 +211,8 @@ class LoopWatchdog:
     """Watches LOOP from ``start`` to ``close``, both on it.
 
     REPORT gets a sentence when something held the loop, on the loop; WHILE_HELD is called in the watchdog's
-    thread again and again while something does; its argument returns whether that is still so. ATTEND is
-    called in this thread whenever the descriptor NEWS_FD is readable, whatever the loop does.
+    thread again and again while something does; its argument returns whether that is still so. ON_EVENTS is
+    called in this thread whenever the descriptor EVENTS_FD is readable, whatever the loop does.
     """
 
     def __init__(
@@ -220,14 +220,14 @@ class LoopWatchdog:
         loop: WatchedLoop,
         report: Callable[[str], None],
         while_held: Callable[[Callable[[], bool]], None],
-        news_fd: int,
-        attend: Callable[[], None],
+        events_fd: int,
+        on_events: Callable[[], None],
     ) -> None:
         self._loop = loop
         self._report = report
         self._while_held = while_held
-        self._news_fd = news_fd
-        self._attend = attend
+        self._events_fd = events_fd
+        self._on_events = on_events
         self._selector = loop.watched
         self._loop_thread = threading.get_ident()
         self._thread = threading.Thread(target=self._run, name="loop watchdog", daemon=True)
@@ -258,15 +258,15 @@ class LoopWatchdog:
 
     def _run(self) -> None:
         poll = select.poll()
-        for fd in (self._news_fd, self._selector.timer.fd):
+        for fd in (self._events_fd, self._selector.timer.fd):
             poll.register(fd, select.POLLIN)
         while True:
             ready = [fd for fd, _ in poll.poll()]
             if self._closing:
                 return
             try:
-                if self._news_fd in ready:
-                    self._attend()
+                if self._events_fd in ready:
+                    self._on_events()
                 if self._selector.timer.has_expired() and (since_s := self._selector.busy_since_s):
                     self._while_held(functools.partial(self._is_held, since_s))
                     self._look(since_s)

@@ -3,7 +3,7 @@
 While the loop is held, a thread (support/loop_watchdog.py) looks at what clients have sent without taking
 it, and stops the nodes when there is a stop from one who may stop them. The loop reads the same bytes when it
 can, and answers them: that changes nothing any more. ``canductor estop`` comes with a new connection, which
-takes the loop several rounds: who comes is let in (acceptor.py) and looked at by the thread at any time.
+takes the loop several rounds: the thread accepts (acceptor.py) and looks at new connections at any time.
 """
 
 import asyncio
@@ -62,11 +62,12 @@ class StopLane:
         self._peeking: dict[Hashable, socket.socket] = {}
         self._others: dict[Finder, Finder] = {}
         self._accepting: dict[socket.socket, Callable[[], object]] = {}
-        self._news = select.epoll()
-        """Has what is new and what accepts it, by descriptor; says once that something has come there."""
-        self._at_news: dict[int, Callable[[], object]] = {}
-        self.news_fd: Final = self._news.fileno()
-        """Readable when ``look_at_news`` has something to do."""
+        self._epoll = select.epoll()
+        """Of sockets that listen and of new connections; edge-triggered."""
+        self._callbacks: dict[int, Callable[[], object]] = {}
+        """By their descriptors."""
+        self.events_fd: Final = self._epoll.fileno()
+        """Readable when ``handle_events`` has something to do."""
 
     @contextlib.contextmanager
     def _turn(self) -> Iterator[None]:
@@ -119,19 +120,19 @@ class StopLane:
 
     def _settle(self, opened: socket.socket) -> None:
         if self._new.pop(opened, None) is not None:
-            self._expect_no_news(opened)
+            self._unregister(opened)
 
     def listen(self, listener: socket.socket, accept: Callable[[], object]) -> None:
-        """Call ACCEPT when somebody comes to LISTENER and at each look, until ``listen_no_more``."""
+        """Call ACCEPT when LISTENER has connections and at each look, until ``listen_no_more``."""
         with self._turn():
             self._accepting[listener] = accept
-            self._expect_news(listener, accept)
+            self._register(listener, accept)
 
     def listen_no_more(self, listener: socket.socket) -> None:
         """End that; LISTENER may be closed then."""
         with self._turn():
             if self._accepting.pop(listener, None) is not None:
-                self._expect_no_news(listener)
+                self._unregister(listener)
 
     def look_also(self, find: Finder) -> None:
         """Ask FIND as well: it looks where there is no socket."""
@@ -143,8 +144,8 @@ class StopLane:
         with self._turn():
             for own in self._peeking.values():
                 own.close()
-            self._news.close()
-            self._at_news.clear()
+            self._epoll.close()
+            self._callbacks.clear()
             self._unread.clear()
             self._new.clear()
             self._peeking.clear()
@@ -165,33 +166,33 @@ class StopLane:
         """Ask FIND about OPENED, just accepted, until it is watched under a key, or ``settle`` of it."""
         with self._turn():
             self._new[opened] = find
-            self._expect_news(opened, functools.partial(self._look_at_new, opened))
+            self._register(opened, functools.partial(self._look_at_new, opened))
 
-    def _expect_news(self, opened: socket.socket, call: Callable[[], object]) -> None:
-        """Have ``look_at_news`` CALL when something comes at OPENED; at once if it has come."""
-        if self._news.closed:
+    def _register(self, opened: socket.socket, call: Callable[[], object]) -> None:
+        """Have ``handle_events`` CALL when OPENED becomes readable, or is."""
+        if self._epoll.closed:
             return
         with contextlib.suppress(OSError):  # without room for it, it waits until the loop is held
-            self._news.register(opened, select.EPOLLIN | select.EPOLLET)
-            self._at_news[opened.fileno()] = call
+            self._epoll.register(opened, select.EPOLLIN | select.EPOLLET)
+            self._callbacks[opened.fileno()] = call
 
-    def _expect_no_news(self, opened: socket.socket) -> None:
-        if opened.fileno() >= 0 and not self._news.closed:  # a closed one is out already
-            self._at_news.pop(opened.fileno(), None)
+    def _unregister(self, opened: socket.socket) -> None:
+        if opened.fileno() >= 0 and not self._epoll.closed:  # a closed one is out already
+            self._callbacks.pop(opened.fileno(), None)
             with contextlib.suppress(FileNotFoundError):
-                self._news.unregister(opened)
+                self._epoll.unregister(opened)
 
     # ---- In the lane's thread ----
 
-    def look_at_news(self) -> None:
-        """Let in who has come, and look at what they have sent since they were looked at last.
+    def handle_events(self) -> None:
+        """Accept new connections, and look at what they have sent since the last call.
 
         A failure hides no stop found elsewhere, and is raised at the end.
         """
         failures: list[Exception] = []
-        for fd, _ in self._news.poll(0):
+        for fd, _ in self._epoll.poll(0):
             try:
-                self._at_news.get(fd, _nothing)()
+                self._callbacks.get(fd, _nothing)()
             except Exception as error:  # noqa: BLE001 (as above)
                 failures.append(error)
         if failures:

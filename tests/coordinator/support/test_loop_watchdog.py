@@ -27,8 +27,8 @@ class Watched:
         self._since_s = 0.0
         self._late_looks = 0
         self._over = threading.Event()
-        self.news_fd = os.eventfd(0)
-        self.attended = threading.Event()
+        self.events_fd = os.eventfd(0)
+        self.handled = threading.Event()
         self.fails = False
 
     def hold_the_loop(self) -> None:
@@ -45,18 +45,18 @@ class Watched:
         if self._late_looks > 2:
             self._over.set()
 
-    def attend(self) -> None:
-        os.eventfd_read(self.news_fd)
+    def on_events(self) -> None:
+        os.eventfd_read(self.events_fd)
         self.threads.add(threading.get_ident())
         if self.fails:
             self.fails = False
             raise RuntimeError("shown")
-        self.attended.set()
+        self.handled.set()
 
     async def main(self, *actions: Callable[[], None]) -> None:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, WatchedLoop)
-        watchdog = LoopWatchdog(loop, self.reports.append, self.while_held, self.news_fd, self.attend)
+        watchdog = LoopWatchdog(loop, self.reports.append, self.while_held, self.events_fd, self.on_events)
         watchdog.start()
         try:
             for act in actions:
@@ -70,7 +70,7 @@ class Watched:
     def run(self, *actions: Callable[[], None]) -> None:
         with asyncio.Runner(loop_factory=WatchedLoop) as runner:
             runner.run(self.main(*actions))
-        os.close(self.news_fd)
+        os.close(self.events_fd)
 
 
 def test_who_holds_the_loop_is_named_and_others_are_counted() -> None:
@@ -91,19 +91,19 @@ def test_a_hold_is_over_when_the_loop_goes_on() -> None:
     assert held == [False]
 
 
-def test_news_are_attended_to_whatever_the_loop_does(capsys: pytest.CaptureFixture[str]) -> None:
-    """In the thread: who comes does not wait for the rounds of a loop that has much to do."""
+def test_events_are_handled_whatever_the_loop_does(capsys: pytest.CaptureFixture[str]) -> None:
+    """In the thread: new connections do not wait for the rounds of a busy loop."""
     watched = Watched()
 
-    def tell() -> None:
+    def signal_events() -> None:
         watched.fails = True
         for _ in range(2):
-            os.eventfd_write(watched.news_fd, 1)
+            os.eventfd_write(watched.events_fd, 1)
             while watched.fails:  # a failure is shown, and ends nothing
                 time.sleep(0)
-        assert watched.attended.wait(PATIENCE_S)
+        assert watched.handled.wait(PATIENCE_S)
 
-    watched.run(tell)
+    watched.run(signal_events)
     assert watched.threads.isdisjoint({threading.get_ident()})
     assert "RuntimeError: shown" in capsys.readouterr().err
 

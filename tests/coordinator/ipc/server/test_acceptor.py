@@ -29,7 +29,7 @@ def test_many_who_come_at_once_leave_the_rounds_of_the_loop_short(tmp_path: Path
         for number, guest in enumerate(guests):
             guest.connect(str(tmp_path / "socket"))
             if number < ahead:
-                lane.look_at_news()
+                lane.handle_events()
         while len(come) < GUESTS:
             before = len(come)
             await asyncio.sleep(0)

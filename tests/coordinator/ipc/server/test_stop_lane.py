@@ -385,33 +385,33 @@ def test_a_new_connection_over_tcp_that_the_loop_has_begun_to_take(
 
 
 @TLS
-def test_who_comes_is_attended_to_at_once(
+def test_a_new_connection_is_looked_at_while_the_loop_is_free(
     tmp_path: Path, certificate: tuple[Path, Path], *, secret: bool
 ) -> None:
     """By the thread, while nothing holds the loop: a stop waited for some rounds of it, more with TLS."""
     lane, chosen = Lane(), certificate if secret else None
     hello = line({**HELLO, "params": {"version": 1, "token": TOKENS[Scope.OPERATE]}})
 
-    def news() -> bool:
-        return bool(select.select([lane.news_fd], [], [], 0.0)[0])
+    def is_readable() -> bool:
+        return bool(select.select([lane.events_fd], [], [], 0.0)[0])
 
-    def attend() -> None:
-        assert select.select([lane.news_fd], [], [], PATIENCE_S)[0]
-        lane.look_at_news()
+    def handle() -> None:
+        assert select.select([lane.events_fd], [], [], PATIENCE_S)[0]
+        lane.handle_events()
 
     async def go(served: Served) -> None:
         dialled = Dialled(served.server.tcp_port or 0, chosen)
         while not dialled.shake_hands():
-            attend()
+            handle()
         dialled.send(hello)
-        while news():
-            lane.look_at_news()
+        while is_readable():
+            lane.handle_events()
         assert lane.stops == []
         dialled.send(line(STOP))
         while not lane.stops:
-            attend()
+            handle()
         assert lane.stops == ["me"]
-        assert not news(), "it is said once"
+        assert not is_readable(), "it is said once"
         assert served.stops == []
         await lane.is_unread_until_done(served.stops)
         dialled.send(line({"id": 3, "method": "machine.info"}))
@@ -420,14 +420,14 @@ def test_who_comes_is_attended_to_at_once(
             while b'"id":3' not in answers.replace(b" ", b""):
                 await asyncio.sleep(0.01)
                 answers += dialled.receive()
-        assert not news(), "the loop reads it now"
+        assert not is_readable(), "the loop reads it now"
         dialled.close()
         await served.server_has(0)
 
     run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, chosen))
 
 
-def test_many_who_come_at_once_are_all_served(tmp_path: Path) -> None:
+def test_many_connections_at_once_are_all_served(tmp_path: Path) -> None:
     """Those that the thread has accepted, some in each round of the loop, and those beyond."""
     lane = Lane()
 
@@ -436,7 +436,7 @@ def test_many_who_come_at_once_are_all_served(tmp_path: Path) -> None:
         for opened in come:
             opened.connect(served.at)
             opened.sendall(line(HELLO))
-            lane.look_at_news()
+            lane.handle_events()
         for opened in come:
             opened.setblocking(False)
             async with asyncio.timeout(PATIENCE_S):
@@ -461,6 +461,33 @@ def test_a_look_that_fails_hides_no_stop() -> None:
         with pytest.raises(OSError, match="closed"):
             lane.look()
         assert lane.stops == ["me"]
+
+
+def test_an_event_that_fails_hides_no_stop() -> None:
+    """Of another connection, and closed sockets are no failure."""
+    lane, (ours, theirs), (left, gone) = Lane(), socket.socketpair(), socket.socketpair()
+
+    def fail() -> None:
+        raise OSError("no file left")
+
+    with socket.socket(socket.AF_INET) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        lane.listen(listener, fail)
+        lane.watch_new(ours, lambda: "me")
+        lane.watch_new(left, lambda: "nobody")
+        left.close()
+        gone.close()
+        with socket.create_connection(listener.getsockname()):
+            theirs.sendall(b"a stop")
+            with pytest.raises(OSError, match="no file left"):
+                lane.handle_events()
+        assert lane.stops == ["me"]
+        lane.settle(left)
+        lane.listen_no_more(listener)
+        lane.close()
+    for opened in (ours, theirs):
+        opened.close()
 
 
 def test_a_look_ends_when_the_loop_goes_on() -> None:
