@@ -9,7 +9,6 @@ ahead as it may be, after REST_CYCLE_S while the machine has nothing to do; or a
 import asyncio
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
 from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Notice, StandstillAction
@@ -22,6 +21,7 @@ from coordinator.streaming.timed_events import Due, DueEvents
 from coordinator.streaming.worker import SEND_AHEAD_S, START_LEAD_S, Cycle, MotionWorker
 from nodes.support.awake import call_between
 from nodes.support.errors import CanductorError
+from nodes.support.work_thread import WorkThread
 
 CYCLE_S: Final = 0.05
 FULL_CYCLE_S: Final = 0.6
@@ -170,8 +170,7 @@ class Streamer:
     # ------------------------------------------------------------------------------------------- streaming
 
     async def _stream(self) -> None:
-        loop = asyncio.get_running_loop()
-        with ThreadPoolExecutor(1, thread_name_prefix="motion") as thread:
+        with WorkThread("motion") as thread:
             event: Event | None = None
             while not isinstance(event, End):
                 self._called = False
@@ -181,7 +180,7 @@ class Streamer:
                 if rested:  # nothing came: it is done sooner than two threads are woken
                     cycle = self.worker.work(event)
                 else:
-                    cycle = await loop.run_in_executor(thread, self.worker.work, event)
+                    cycle = await thread.run(self.worker.work, event)
                 event = cycle.event
                 if isinstance(event, Emergency):
                     self._hand_over(cycle)
@@ -292,14 +291,13 @@ class Streamer:
         self._busy = self._machine.is_busy(BUSY_LOAD)
         self.worker.start_lead_s = (BUSY_START_LEAD_S if self._busy else START_LEAD_S) + self._delay_s
 
-    async def _settle(self, thread: ThreadPoolExecutor) -> None:
+    async def _settle(self, thread: WorkThread) -> None:
         """Bring what is left to the nodes and wait until the last step is executed."""
-        loop = asyncio.get_running_loop()
         ends_s = self.ended_s + self.worker.steps.lag_s + SETTLE_S
         ended = False
         while not ended:
             ended = self.print_time_now() >= ends_s  # then once more, so that what ended last is reported
-            cycle = await loop.run_in_executor(thread, self.worker.rest)
+            cycle = await thread.run(self.worker.rest)
             self._hand_over(cycle)
             self._report_cycle(cycle)
             if not ended:

@@ -15,6 +15,8 @@ import socket
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, Final, TypeVar
 
+from nodes.support.work_thread import ThreadlessLoop
+
 T = TypeVar("T")
 LIMIT_S: Final = 3_600.0
 """Virtual time that a test may take."""
@@ -88,7 +90,7 @@ class _JumpSelector(selectors.BaseSelector):
         self._barrier.close()
 
 
-class JumpLoop(asyncio.SelectorEventLoop):
+class JumpLoop(asyncio.SelectorEventLoop, ThreadlessLoop):
     """The loop; its time() begins at 0.
 
     Nothing takes time but waiting, and each look at the clock, by whoever, LOOK_S: with more than 0 the

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, Final, TypeVar
 
 from nodes.support.errors import CanductorError
+from nodes.support.work_thread import ThreadlessLoop
 from nodes.virtual.world.world import World
 
 T = TypeVar("T")
@@ -56,7 +57,7 @@ class _WorldSelector:
         """Do nothing: there are no resources."""
 
 
-class VirtualLoop(base_events.BaseEventLoop):
+class VirtualLoop(base_events.BaseEventLoop, ThreadlessLoop):
     """A loop whose time() is WORLD's; raises Stuck after LIMIT_S of virtual time, or when nothing can happen.
 
     Functions for an executor run at once and take EXECUTOR_S of virtual time. ``deliver`` sends signals.

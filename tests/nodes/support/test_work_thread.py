@@ -1,0 +1,78 @@
+"""A thread that works for a loop: what it returns and raises, in which thread, and how it ends."""
+
+import asyncio
+import threading
+
+import pytest
+
+from nodes.support.errors import CanductorError
+from nodes.support.work_thread import WorkThread
+from tests.stages import jump_loop
+
+
+def test_all_work_is_done_in_one_thread_which_ends_with_the_block() -> None:
+    async def main() -> tuple[threading.Thread, list[threading.Thread]]:
+        with WorkThread("motion") as thread:
+            done_in = [await thread.run(threading.current_thread) for _ in range(3)]
+            assert await thread.run(divmod, 7, 4) == (1, 3)
+        return threading.current_thread(), done_in
+
+    loop_thread, done_in = asyncio.run(main())
+    (worker,) = set(done_in)
+    assert worker is not loop_thread
+    assert worker.name == "motion"
+    assert not worker.is_alive()
+
+
+def test_what_the_work_raises_is_raised_and_the_thread_goes_on() -> None:
+    def fail() -> None:
+        raise CanductorError("it was in vain")
+
+    async def main() -> int:
+        with WorkThread("motion") as thread:
+            with pytest.raises(CanductorError, match="it was in vain"):
+                await thread.run(fail)
+            return await thread.run(abs, -4)
+
+    assert asyncio.run(main()) == 4
+
+
+def test_a_block_that_is_left_waits_for_work_that_was_begun() -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    finished = []
+
+    def work() -> None:
+        begun.set()
+        go_on.wait()
+        finished.append(True)
+
+    async def main() -> None:
+        with WorkThread("motion") as thread:
+            waiting = asyncio.ensure_future(thread.run(work))
+            await asyncio.to_thread(begun.wait)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+            go_on.set()
+        assert finished == [True]
+
+    asyncio.run(main())
+
+
+def test_without_work_there_is_no_thread() -> None:
+    async def main() -> None:
+        before = threading.active_count()
+        with WorkThread("motion"):
+            assert threading.active_count() == before
+
+    asyncio.run(main())
+
+
+def test_a_loop_without_threads_does_it_itself() -> None:
+    async def main() -> None:
+        with WorkThread("motion") as thread:
+            assert await thread.run(threading.current_thread) is threading.current_thread()
+            with pytest.raises(ZeroDivisionError):
+                await thread.run(divmod, 1, 0)
+
+    jump_loop.run(main())
