@@ -26,7 +26,10 @@ class ModuleContext:
         """For modules of the project: what others may rely upon are the methods."""
         self.say = say
         self._time_base = machine.time_base()
-        self._timers: set[_Timer] = set()
+        self._periodic: dict[float, _PeriodicTimer] = {}
+        """By their periods."""
+        self._timers: set[Callable[[], None]] = set()
+        """What cancels them."""
         self._loop = asyncio.get_running_loop()
 
     def node(self, name: str) -> Node:
@@ -47,14 +50,14 @@ class ModuleContext:
 
     def ticks_at(self, node: str, print_time_s: float) -> int:
         """Return what the clock of a node shows at a print time; 64 bits."""
-        return self.node(node).best_clock.ticks_at(self._time_base.host_ns_at(print_time_s))
+        return self._time_base.ticks_at(self.node(node).best_clock, print_time_s)
 
     def print_time_of(self, node: str, clock32: int) -> float:
         """Return the print time at which a node's clock shows CLOCK32, the nearest one to now."""
         clock = self.node(node).best_clock
         now_ns = self.machine.host.now()
         ticks = extend32(clock32, Ticks(clock.ticks_at(now_ns)))
-        return self._time_base.print_time_at(clock.ns_at(ticks))
+        return self._time_base.print_time_of(clock, ticks)
 
     def soon_on_loop(self, call: Callable[[], None]) -> None:
         """Call CALL on the control loop; from any thread."""
@@ -67,15 +70,28 @@ class ModuleContext:
         Calls of one period come together, so that they wake the computer once, and up to a tenth of it later,
         when it is awake anyway: the first comes after half to one and a half periods.
         """
-        timer = _Timer(seconds, call, again=True, ended=self._timers.discard)
-        self._timers.add(timer)
-        return timer.end
+        if seconds not in self._periodic:
+            self._periodic[seconds] = _PeriodicTimer(seconds)
+        return self._periodic[seconds].add(call)
 
-    def after(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
-        """Call CALL once after so many seconds; returns what cancels it."""
-        timer = _Timer(seconds, call, again=False, ended=self._timers.discard)
-        self._timers.add(timer)
-        return timer.end
+    def after(self, least_s: float, call: Callable[[], None], most_s: float = 0.0) -> Callable[[], None]:
+        """Call CALL once after so many seconds; return what cancels it.
+
+        With more than LEAST_S as MOST_S it comes between the two, when the computer is awake anyway.
+        """
+        now_s = self._loop.time()
+
+        def fire() -> None:
+            self._timers.discard(cancel)
+            call()
+
+        def end() -> None:
+            self._timers.discard(cancel)
+            cancel()
+
+        cancel = call_between(now_s + least_s, now_s + max(least_s, most_s), fire)
+        self._timers.add(cancel)
+        return end
 
     def save(self, section: str, option: str, text: str) -> None:
         """Save a calibrated value with the next SAVE_CONFIG; raises SaveError for text it cannot write."""
@@ -100,38 +116,57 @@ class ModuleContext:
 
     def close(self) -> None:
         """End all timers."""
-        for timer in tuple(self._timers):
-            timer.end()
+        for timer in self._periodic.values():
+            timer.close()
+        for cancel in self._timers:
+            cancel()
+        self._timers.clear()
 
 
-class _Timer:
-    def __init__(
-        self, seconds: float, call: Callable[[], None], *, again: bool, ended: Callable[["_Timer"], None]
-    ) -> None:
+class _PeriodicTimer:
+    """Calls what is to be called every so many SECONDS, all at once."""
+
+    def __init__(self, seconds: float) -> None:
         self._seconds = seconds
-        self._call = call
-        self._again = again
-        self._ended = ended
         self._loop = asyncio.get_running_loop()
-        self._due_s = self._loop.time() + seconds
-        if again:
-            self._due_s = round(self._due_s / seconds) * seconds
-        self._cancel = self._wait()
+        self._calls: dict[object, tuple[float, Callable[[], None]]] = {}
+        """From when on it is called, the loop's time, and what."""
+        self._due_s = 0.0
+        self._cancel: Callable[[], None] | None = None
 
-    def _wait(self) -> Callable[[], None]:
-        if self._again:
-            return call_between(self._due_s, self._due_s + SLACK * self._seconds, self._fire)
-        return self._loop.call_at(self._due_s, self._fire).cancel
+    def add(self, call: Callable[[], None]) -> Callable[[], None]:
+        """Call CALL, too; return what ends that."""
+        key, now_s = object(), self._loop.time()
+        self._calls[key] = now_s + self._seconds / 2, call
+        if self._cancel is None:
+            self._due_s = round(now_s / self._seconds + 1) * self._seconds
+            self._wait()
+
+        def end() -> None:
+            self._calls.pop(key, None)
+            if not self._calls:
+                self.close()
+
+        return end
+
+    def close(self) -> None:
+        """Call nothing more."""
+        self._calls.clear()
+        if self._cancel is not None:
+            self._cancel()
+            self._cancel = None
+
+    def _wait(self) -> None:
+        self._cancel = call_between(self._due_s, self._due_s + SLACK * self._seconds, self._fire)
 
     def _fire(self) -> None:
-        if self._again:
-            # Missed calls are not repeated: the loop was busy, or the machine slept.
-            self._due_s = max(self._due_s + self._seconds, self._loop.time())
-            self._cancel = self._wait()
-        else:
-            self._ended(self)
-        self._call()
-
-    def end(self) -> None:
-        self._cancel()
-        self._ended(self)
+        due_s = self._due_s
+        # Missed calls are not repeated: the loop was busy, or the machine slept.
+        self._due_s = max(due_s + self._seconds, self._loop.time())
+        self._wait()
+        for key, (from_s, call) in tuple(self._calls.items()):
+            if key in self._calls and from_s <= due_s:
+                try:
+                    call()
+                except Exception as bug:  # noqa: BLE001 (the others are called all the same)
+                    self._loop.call_exception_handler({"message": "a regular call failed", "exception": bug})

@@ -118,6 +118,22 @@ class TimeBase:
         """Return the host time of a print time."""
         return self._primary.ns_at(Ticks(round(print_time * self._clock_freq)))
 
+    def ticks_at(self, clock: EstimatedClock, print_time: float) -> Ticks:
+        """Return a node's ticks at PRINT_TIME as CLOCK estimates them.
+
+        A clock that pulses tie to the primary's needs no host time: the primary's estimate, which another
+        thread may renew between two looks at it, has no part in it.
+        """
+        if clock is self._primary:
+            return Ticks(round(print_time * self._clock_freq))
+        if isinstance(clock, PulseClock) and clock.reference is self._primary:
+            return clock.line.ticks_at(Ticks(round(print_time * self._clock_freq)))
+        return clock.ticks_at(self.host_ns_at(print_time))
+
+    def print_time_of(self, clock: EstimatedClock, ticks: Ticks) -> float:
+        """Return the print time at which a node's clock, as CLOCK estimates it, shows TICKS."""
+        return ticks / self._clock_freq if clock is self._primary else self.print_time_at(clock.ns_at(ticks))
+
     def primary_map(self, print_time: float) -> ClockMap:
         """Return the primary node's own map, which never bends."""
         ticks = print_time * self._clock_freq
@@ -125,8 +141,8 @@ class TimeBase:
 
     def secondary_map(self, clock: EstimatedClock, clock_freq: float, print_time: float) -> ClockMap:
         """Return a secondary node's map, beginning at PRINT_TIME where the estimators see its clock."""
-        ticks = self._ticks(clock, print_time)
-        ahead = self._ticks(clock, print_time + STEER_HORIZON_S)
+        ticks = self.ticks_at(clock, print_time)
+        ahead = self.ticks_at(clock, print_time + STEER_HORIZON_S)
         return ClockMap(clock_freq, ClockPiece(print_time, ticks, (ahead - ticks) / STEER_HORIZON_S))
 
     def steer(self, name: str, clock_map: ClockMap, clock: EstimatedClock, print_time: float) -> ClockPiece:
@@ -136,8 +152,8 @@ class TimeBase:
         """
         last = clock_map.last
         mapped = last.ticks + (print_time - last.print_time) * last.ticks_per_s
-        here = self._ticks(clock, print_time)
-        ahead = self._ticks(clock, print_time + STEER_HORIZON_S)
+        here = self.ticks_at(clock, print_time)
+        ahead = self.ticks_at(clock, print_time + STEER_HORIZON_S)
         off_s = (here - mapped) / clock_map.clock_freq
         if abs(off_s) > JUMP_LIMIT_S:
             raise ClockJumpError(
@@ -148,13 +164,3 @@ class TimeBase:
         slew = (here - mapped) / STEER_HORIZON_S
         limit = SLEW_LIMIT * rate
         return clock_map.bend(print_time, rate + min(max(slew, -limit), limit))
-
-    def _ticks(self, clock: EstimatedClock, print_time: float) -> Ticks:
-        """Return a node's ticks at PRINT_TIME as CLOCK estimates them.
-
-        A clock that pulses tie to the primary's needs no host time: the primary's estimate, which another
-        thread may renew between two looks at it, has no part in it.
-        """
-        if isinstance(clock, PulseClock) and clock.reference is self._primary:
-            return clock.line.ticks_at(Ticks(round(print_time * self._clock_freq)))
-        return clock.ticks_at(self.host_ns_at(print_time))

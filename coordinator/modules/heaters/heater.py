@@ -41,6 +41,8 @@ SILENT_LOOKS: Final = 2
 
 STALE_SPARE_S: Final = 0.2
 """How long before the node would stop it a power is switched off that no measurement has renewed."""
+STALE_EARLY_S: Final = 0.3
+"""So much earlier that is checked when the computer is awake anyway, as for measurements."""
 STALE_AGAIN_S: Final = 0.01
 """Least time until the next check of that."""
 
@@ -318,7 +320,11 @@ class Heater:
             return
         self._on, self._applied_s = power > 0, live.now_s()
         if self._on and self._stale_check is None:
-            self._stale_check = live.after(self._stale_s, self._end_stale_heat)
+            self._check_stale_in(live, self._stale_s)
+
+    def _check_stale_in(self, live: "ModuleContext", left_s: float) -> None:
+        early_s = max(left_s - STALE_EARLY_S, STALE_AGAIN_S)
+        self._stale_check = live.after(early_s, self._end_stale_heat, most_s=left_s)
 
     def _end_stale_heat(self) -> None:
         """Switch off when no measurement has renewed the power for too long: the temperature is unknown."""
@@ -328,8 +334,8 @@ class Heater:
         left_s = self._stale_s - (live.now_s() - self._applied_s)
         if left_s < 0:
             self._apply(0.0)
-        else:  # it was renewed since
-            self._stale_check = live.after(max(left_s, STALE_AGAIN_S), self._end_stale_heat)
+        else:  # it was renewed since, or this comes early
+            self._check_stale_in(live, left_s)
 
     def _look(self) -> None:
         """Check that there still are measurements; stop the machine, or switch off, if there are none."""

@@ -90,8 +90,8 @@ class ScriptedLive:
     def every(self, seconds: float, call: Callable[[], None]) -> None:
         self.timers.append((seconds, call))
 
-    def after(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
-        self.later.append((seconds, call))
+    def after(self, least_s: float, call: Callable[[], None], most_s: float = 0.0) -> Callable[[], None]:
+        self.later.append((max(least_s, most_s), call))
         return lambda: None
 
     def save(self, section: str, option: str, text: str) -> None:
