@@ -58,7 +58,7 @@ class ExcludeObject(Module):
         """Report the objects, which of them are left out, and which one is being read."""
         return {
             "objects": [_status(found) for found in tuple(self._objects.values())],
-            "excluded_objects": [*sorted(self._excluded)],
+            "excluded_objects": self.excluded,
             "current_object": self._current,
         }
 
@@ -75,6 +75,11 @@ class ExcludeObject(Module):
             elif each.center is not None:
                 found.append([each.center])
         return found
+
+    @property
+    def excluded(self) -> list[str]:
+        """Names of the objects that are left out."""
+        return sorted(self._excluded)
 
     @property
     def leaves_out(self) -> bool:

@@ -210,8 +210,8 @@ class Journal:
             whole = text if entry is head or head is None else json.dumps(head) + "\n" + text
             atomic_write(self._path, whole.encode())
             return len(whole)
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(text)
+        with self._path.open("ab") as file:
+            file.write(text.encode())
         return size + len(text)
 
     def _sync(self, size: int) -> int:

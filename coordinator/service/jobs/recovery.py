@@ -18,6 +18,7 @@ from coordinator.gcode.events import Event, Full, Notice
 from coordinator.gcode.parser import WordError, command_line
 from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.modules.base import Module
 from coordinator.modules.compensation.bed_mesh import RESTORE, BedMesh
 from coordinator.modules.compensation.bed_tilt import BedTilt
 from coordinator.modules.programs.exclude_object import ExcludeObject
@@ -91,6 +92,45 @@ class RecoverWork(FileWork):
         return FileWork.step(self)
 
 
+class _Kept:
+    """What of MODULES is written down with each line; found once for each job."""
+
+    def __init__(self, modules: Modules) -> None:
+        self._tilt = next(modules.of(BedTilt), None)
+        self._mesh = next(modules.of(BedMesh), None)
+        self._heaters: dict[str, Module] = {}
+        self._fans: dict[str, Module] = {}
+        self._objects = next(modules.of(ExcludeObject), None)
+        for module in modules.of(Module):
+            kind, _, instance = module.name.partition(" ")
+            if kind.startswith(("extruder", "heater_")):
+                self._heaters[instance or kind] = module
+            elif kind in ("fan", "fan_generic"):
+                self._fans[instance or kind] = module
+
+    def hot(self) -> Mapping[str, Any]:
+        """Return heater targets, fan speeds and excluded objects, as the modules report them."""
+        targets = {name: module.status().get("target") for name, module in self._heaters.items()}
+        speeds = {name: module.status().get("speed") for name, module in self._fans.items()}
+        return {
+            "heaters": {n: round(t, 3) for n, t in targets.items() if isinstance(t, int | float) and t > 0},
+            "fans": {n: round(v, 4) for n, v in speeds.items() if isinstance(v, int | float)},
+            "excluded": [] if self._objects is None else self._objects.excluded,
+        }
+
+    def mesh(self, motion: Motion) -> Mapping[str, Any]:
+        """Return the mesh that Z follows, and how much higher the head stands for it, or for a tilt."""
+        mesh = self._mesh
+        held = None if mesh is None else mesh.held()
+        if self._tilt is None and held is None:
+            return {}
+        x, y, z, _ = (motion.trace.at(motion.now_s) or motion.planned).position
+        if self._tilt is not None:
+            return {"bed_mm": self._tilt.added_mm((x, y, z))}
+        assert mesh is not None
+        return {"mesh": held, "bed_mm": mesh.added_mm((x, y, z))}
+
+
 class Recovery:
     """Keeps the journal of SERVICE's jobs in the folder STATE, has an interrupted one go on; on the loop."""
 
@@ -100,6 +140,8 @@ class Recovery:
         self._state = state
         self._journal: Journal | None = None
         self._job: JobRun | None = None
+        self._kept: _Kept | None = None
+        """Of the machine that does it."""
         self._noted_s = 0.0
         self._heights_noted: tuple[float, float] | None = None
         self._last: Interrupted | None = None
@@ -140,6 +182,7 @@ class Recovery:
     def begin(self, job: JobRun, program: Program) -> None:
         """Keep the journal of JOB."""
         self._job, self._noted_s, self._last = job, 0.0, None
+        self._kept = _Kept(self._service.up_machine().modules)
         self._modified_ns = program.modified_ns
         self._show(None)
         if self._journal is not None:
@@ -177,16 +220,16 @@ class Recovery:
         return (round(min(low, end_mm), 4), round(max(high, end_mm), 4))
 
     def _held(self, heights: tuple[float, float] | None) -> Mapping[str, Any]:
-        motion, machine = self._service.motion, self._service.machine
-        if motion is None or machine is None:
+        motion, kept = self._service.motion, self._kept
+        if motion is None or kept is None:
             return {}
         return {
             "z": heights,
             "offset": list(motion.feeder.planner.gcode_offset),
             "speed_factor": motion.planned.speed_factor,
             "extrude_factor": motion.planned.extrude_factor,
-            **_hot(machine.modules),
-            **_mesh(machine.modules, motion),
+            **kept.hot(),
+            **kept.mesh(motion),
         }
 
     def _show(self, found: Interrupted | None) -> None:
@@ -323,38 +366,9 @@ class Recovery:
         return RecoverWork(program, line=line, reached=reached, held=found.held, objects=objects)
 
 
-def _mesh(modules: Modules, motion: Motion) -> Mapping[str, Any]:
-    """Return the mesh that Z follows, and how much higher the head stands for it, or for a tilt."""
-    if (tilt := next(modules.of(BedTilt), None)) is not None:
-        x, y, z, _ = (motion.trace.at(motion.now_s) or motion.planned).position
-        return {"bed_mm": tilt.added_mm((x, y, z))}
-    mesh = next(modules.of(BedMesh), None)
-    held = None if mesh is None else mesh.held()
-    if mesh is None or held is None:
-        return {}
-    x, y, z, _ = (motion.trace.at(motion.now_s) or motion.planned).position
-    return {"mesh": held, "bed_mm": mesh.added_mm((x, y, z))}
-
-
 def _take_over(old: Path, path: Path) -> None:
     """Move the journal that an earlier version has left in the job folder, and make the folder of PATH."""
     with contextlib.suppress(OSError):  # the journal says when it cannot be written
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if old.is_file() and not old.is_symlink() and not path.exists():
             shutil.move(old, path)
-
-
-def _hot(modules: "Modules") -> Mapping[str, Any]:
-    """Return heater targets, fan speeds and excluded objects, as the modules report them."""
-    status = modules.status()
-    heaters: dict[str, float] = {}
-    fans: dict[str, float] = {}
-    for name, fields in status.items():
-        kind, _, instance = name.partition(" ")
-        target, speed = fields.get("target"), fields.get("speed")
-        if kind.startswith(("extruder", "heater_")) and isinstance(target, int | float) and target > 0:
-            heaters[instance or kind] = round(float(target), 3)
-        elif kind in ("fan", "fan_generic") and isinstance(speed, int | float):
-            fans[instance or kind] = round(float(speed), 4)
-    excluded = status.get("exclude_object", {}).get("excluded_objects", [])
-    return {"heaters": heaters, "fans": fans, "excluded": excluded}
