@@ -349,11 +349,13 @@ class Machine:
     def let_reports_wait(self, *, rests: bool) -> None:
         """Let what nodes report wait where nothing depends on it; call it again and again.
 
-        What sensors measure while nothing acts on it, and their state while the machine RESTS, too.
+        What sensors measure while nothing acts on it, and their state while the machine RESTS, too. The clock
+        of a node that is the only one need not agree with any other's.
         """
         wait = not self.modules.controls
+        alone = len(self.nodes) == 1
         for node in self.nodes.values():
-            node.let_reports_wait(measurements=wait, state=wait and rests)
+            node.let_reports_wait(measurements=wait, state=wait and rests, clock=alone or (wait and rests))
 
     def is_busy(self, load: float) -> bool:
         """Return whether a bus has carried more than LOAD lately, a share of its time."""

@@ -14,7 +14,7 @@ from nodes.support.errors import CanductorError
 CLOCK: Final = Query("get_clock", "clock")
 UPTIME: Final = Query("get_uptime", "uptime")
 REST_INTERVAL_S: Final = 2.0
-"""At least, between two samples of a clock that is known while nothing needs it."""
+"""At least, between two samples of a clock that is known while nothing needs it closely."""
 SLACK: Final = 0.1
 """By how much of the time between two samples the next may be later."""
 
@@ -46,7 +46,7 @@ class ClockKeeper:
         self.ready = asyncio.Event()
         """Set when the clock is known, or when waiting for it has become pointless."""
         self.rests = False
-        """Whether nothing needs the clock now."""
+        """Whether nothing needs the clock closely now."""
         self._talk = talk
         self._connector = connector
         self._on_estimate = on_estimate

@@ -215,16 +215,16 @@ class Node:
         """Call CALLBACK for every RESPONSE (of OID, unless None); return a function that ends it."""
         return self._talk.on(response, oid, callback)
 
-    def let_reports_wait(self, *, measurements: bool, state: bool) -> None:
+    def let_reports_wait(self, *, measurements: bool, state: bool, clock: bool) -> None:
         """Let what sensors measure and what the node says of its STATE wait for long from now on, or not.
 
-        A node whose state may wait is at rest: it is asked for it less often, too.
+        A node whose CLOCK nothing needs closely is asked for it less often.
         """
         with contextlib.suppress(CanductorError):  # there is no link, or it is lost
             for response, rests in {MEASURED: measurements, **dict.fromkeys(STATE, state)}.items():
                 self._talk.let_wait(response, REST_PATIENCE_S if rests else PATIENCE_S[response])
         if self._keeper is not None:
-            self._keeper.rests = state
+            self._keeper.rests = clock
 
     def explain_shutdown(self, explain: ExplainShutdown) -> None:
         """Have EXPLAIN add to the sentence of a shutdown, until the node is started again."""

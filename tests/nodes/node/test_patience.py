@@ -162,18 +162,22 @@ def test_a_node_that_is_ready_lets_what_comes_all_the_time_wait() -> None:
         for name, seconds in PATIENCE_S.items():
             assert patience_s(name) == seconds if name in responses else name == "sync_pulse"
         for state in (True, False):
-            machine.node.let_reports_wait(measurements=True, state=state)
+            machine.node.let_reports_wait(measurements=True, state=state, clock=state)
             assert patience_s(MEASURED) == REST_PATIENCE_S
             for name in responses.keys() & set(STATE):
                 assert patience_s(name) == (REST_PATIENCE_S if state else PATIENCE_S[name])
-        machine.node.let_reports_wait(measurements=False, state=False)
+        machine.node.let_reports_wait(measurements=False, state=False, clock=False)
         assert patience_s(MEASURED) == PATIENCE_S[MEASURED]
-        machine.node.let_reports_wait(measurements=True, state=True)
+        machine.node.let_reports_wait(measurements=True, state=True, clock=True)
         machine.io.links[-1].failure = LinkError("can0 node 4: lost")
-        machine.node.let_reports_wait(measurements=False, state=False)  # a lost link is reported elsewhere
+        machine.node.let_reports_wait(
+            measurements=False, state=False, clock=False
+        )  # a lost link is reported elsewhere
         machine.io.links[-1].failure = None
         await machine.node.restart()
         assert patience_s(MEASURED) == PATIENCE_S[MEASURED]
 
     machine.run(machine.bus.start, check)
-    machine.node.let_reports_wait(measurements=True, state=True)  # without effect on one that is closed
+    machine.node.let_reports_wait(
+        measurements=True, state=True, clock=True
+    )  # without effect on one that is closed
