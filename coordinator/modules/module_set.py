@@ -139,6 +139,9 @@ class ModuleSet:
         self.settings = settings or {}
         self._machine = machine
         self._modules: list[Module] = []
+        self._named: dict[str, list[Module]] = {}
+        self._controlling: list[Module] = []
+        """Those that may ever act on what sensors measure."""
         self._places: dict[Module, Place] = {}
         self._devices: dict[str, list[tuple[Device, PinDescription | None]]] = {}
         self._commands: dict[str, GCodeCommand] = {}
@@ -215,6 +218,9 @@ class ModuleSet:
 
     def _add(self, module: Module, build: Build) -> None:
         self._modules.append(module)
+        self._named.setdefault(module.name, []).append(module)
+        if type(module).controls is not Module.controls:
+            self._controlling.append(module)
         self._places[module] = build.place
         for node, device, pin in build.devices:
             self._devices.setdefault(node, []).append((device, pin))
@@ -310,7 +316,10 @@ class ModuleSet:
 
     def find(self, name: str, kind: type[K]) -> K | None:
         """Return the module of section NAME, or None when there is none of KIND."""
-        return next((m for m in self._modules if m.name == name and isinstance(m, kind)), None)
+        for module in self._named.get(name, ()):
+            if isinstance(module, kind):
+                return module
+        return None
 
     def names(self, kind: type[Module]) -> list[str]:
         """Return the section names of all modules of KIND."""
@@ -406,7 +415,7 @@ class ModuleSet:
     @property
     def controls(self) -> bool:
         """Whether any of them acts now on what sensors measure."""
-        return any(module.controls for module in self._modules)
+        return any(module.controls for module in self._controlling)
 
     def stopped(self, cause: str) -> None:
         """Inform all modules that the machine is stopped."""

@@ -22,7 +22,7 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.status import motion_figures
 from coordinator.motion.planner.planner import Planner
-from coordinator.motion.steps.steps import StepGenerator, StepperStats
+from coordinator.motion.steps.steps import Issued, StepGenerator
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.timebase import ClockMap, JumpWatch
 from coordinator.streaming.compensation import Compensation
@@ -179,17 +179,17 @@ class MotionWorker:
         due, self.pipeline.due = self.pipeline.due, []
         if self._compensation is not None:
             self._compensation.note(self.steps)
-        steppers = self.steps.stepper_stats()
+        steppers = self.steps.issued()
         stepping = self._stepping(steppers) if batches else []
         return Cycle(batches, list(output), event, self._planned(steppers), due, stepping)
 
-    def _stepping(self, steppers: Sequence[StepperStats]) -> list[str]:
+    def _stepping(self, steppers: Sequence[Issued]) -> list[str]:
         """Return the steppers for which steps were made since the last time."""
         made = {s.name: s.steps for s in steppers}
         before, self._made = self._made, made
         return [name for name, steps in made.items() if steps != before.get(name, 0)]
 
-    def _planned(self, steppers: Sequence[StepperStats]) -> Planned:
+    def _planned(self, steppers: Sequence[Issued]) -> Planned:
         planner = self._planner
         stands = planner.at_standstill and not planner.take().count
         return Planned(
@@ -236,9 +236,9 @@ class MotionWorker:
 
     def _counts(self) -> dict[str, int]:
         """Return where the nodes will count the steppers when all that was made is executed."""
-        return {stepper.name: self._count(stepper) for stepper in self.steps.stepper_stats()}
+        return {stepper.name: self._count(stepper) for stepper in self.steps.issued()}
 
-    def _count(self, stepper: StepperStats) -> int:
+    def _count(self, stepper: Issued) -> int:
         return stepper.issued + self.began_at.get(stepper.name, 0)
 
     def _all_generated(self) -> bool:

@@ -165,9 +165,13 @@ class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
 
     def _process_events(self, event_list: list[tuple[selectors.SelectorKey, int]]) -> None:
         super()._process_events(event_list)  # type: ignore[misc]
-        if self.watched.rested and all(key.fd in self._unhurried for key, _ in event_list):
-            for call in tuple(self._when_awake):
-                call()
+        if not self.watched.rested:
+            return
+        for key, _ in event_list:
+            if key.fd not in self._unhurried:
+                return
+        for call in tuple(self._when_awake):
+            call()
 
     def call_between(
         self, earliest_s: float, latest_s: float, call: Callable[[], None]
@@ -192,6 +196,8 @@ class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
         return end
 
     def _call_what_has_time(self) -> None:
+        if not self._flexible:
+            return
         now_s = self.time()
         for flexible in [flexible for flexible in self._flexible if flexible.earliest_s <= now_s]:
             flexible.handle.cancel()

@@ -163,11 +163,11 @@ class ClockEstimator:
 
     def ticks_at(self, at_ns: HostTime) -> Ticks:
         """Return the node's clock at host time AT_NS."""
-        return self.estimate().ticks_at(at_ns)
+        return (self._estimate or self.estimate()).ticks_at(at_ns)
 
     def ns_at(self, ticks: Ticks) -> HostTime:
         """Return the host time at which the node's clock shows TICKS."""
-        return self.estimate().ns_at(ticks)
+        return (self._estimate or self.estimate()).ns_at(ticks)
 
     def ahead_s(self, now_ns: int, clock32: int) -> float:
         """Return by how much a clock that was read before NOW_NS is ahead of all it can be; 0: it is not."""

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from nodes.devices.device import Device, ignore
 from nodes.devices.ticks import start_clock, ticks_for
@@ -23,8 +22,7 @@ RANGE_CHECKS: Final = 4
 """Number of consecutive sums out of range after which the node shuts down."""
 
 
-@dataclass(frozen=True, slots=True)
-class AnalogValue:
+class AnalogValue(NamedTuple):
     """A measurement."""
 
     ratio: float

@@ -206,17 +206,18 @@ def encode_values(dictionary: Dictionary, command: MessageFormat, values: Mappin
     """Encode COMMAND with enumeration names resolved; MessageError."""
     resolved: dict[str, Value] = {}
     for param, value in values.items():
-        if not isinstance(value, str):
-            resolved[param] = value
-            continue
-        enumeration = dictionary.enumeration_for(param)
-        if enumeration is None:
-            raise MessageError(f"{command.name}: {param} takes no names, so {value!r} cannot be its value")
-        try:
-            resolved[param] = enumeration.value_of(value)
-        except MessageError as error:
-            raise MessageError(f"{command.name}: {param}: {error}") from None
+        resolved[param] = _resolved(dictionary, command, param, value) if isinstance(value, str) else value
     return command.encode(resolved)
+
+
+def _resolved(dictionary: Dictionary, command: MessageFormat, param: str, name: str) -> int:
+    enumeration = dictionary.enumeration_for(param)
+    if enumeration is None:
+        raise MessageError(f"{command.name}: {param} takes no names, so {name!r} cannot be its value")
+    try:
+        return enumeration.value_of(name)
+    except MessageError as error:
+        raise MessageError(f"{command.name}: {param}: {error}") from None
 
 
 def _text_value(command: MessageFormat, param: str, text: str) -> Value | str:

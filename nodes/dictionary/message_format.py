@@ -21,6 +21,7 @@ CONTENT_MAX: Final[int] = lib.WIRE_CONTENT_MAX
 MAX_PARAMETERS: Final = 32
 NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _BITS32: Final = 0xFFFFFFFF
+_BYTES: Final[int] = lib.WIRE_BYTES
 
 
 class MessageError(CanductorError):
@@ -106,6 +107,7 @@ class MessageFormat:
         self.name = name
         self.message_id = message_id
         self.names = tuple(names)
+        self._known = frozenset(names)
         self.codes = tuple(CODES[code] for code in codes)
         self.code_texts = tuple(codes)
         self._count = len(self.names)
@@ -119,6 +121,7 @@ class MessageFormat:
         self._out = ffi.new("uint8_t[]", CONTENT_MAX)
         self._room = memoryview(ffi.buffer(self._out))
         self.prefix = vlq(message_id)
+        self._content_max = CONTENT_MAX - len(self.prefix)
 
     def __repr__(self) -> str:
         return f"MessageFormat({self.text!r}, {self.message_id})"
@@ -133,44 +136,40 @@ class MessageFormat:
 
     def encode(self, values: Mapping[str, Value]) -> bytes:
         """Encode the message, id included; MessageError when VALUES do not fit it."""
-        if values.keys() != set(self.names):
+        if values.keys() != self._known:
             raise MessageError(self._mismatch(values))
-        numbers: list[int] = []
+        if not self._count:
+            return self.prefix
+        pairs: list[int] = []
         keep: list[object] = []  # what the addresses point into
         for name, code in zip(self.names, self.codes, strict=True):
-            number, address = self._argument(name, code, values[name], keep)
-            numbers += (number, address)
-        self._pairs_write(numbers)
-        count = len(self.names)
-        room = CONTENT_MAX - len(self.prefix)
-        used: int = lib.wire_pack(self._types, count, self._args, self._out, room) if count else 0
-        if count and not used:
+            value = values[name]
+            if code.wire_type == _BYTES:
+                pairs += self._buffer(name, value, keep)
+            else:
+                number = self._number(name, code, value)
+                pairs += (number if code.field == "i" else number & _BITS32, 0)
+        self._pairs.pack_into(self._view, 0, *pairs)
+        used: int = lib.wire_pack(self._types, self._count, self._args, self._out, self._content_max)
+        if not used:
             raise MessageError(
                 f"{self.name}: longer than the {CONTENT_MAX} bytes one block carries; send less at once"
             )
-        return self.prefix + bytes(self._room[:used])
+        return self.prefix + self._room[:used].tobytes()
 
-    def _pairs_write(self, numbers: Sequence[int]) -> None:
-        pairs = iter(numbers)
-        flat = [
-            x
-            for code, number, address in zip(self.codes, pairs, pairs, strict=True)
-            for x in (number if code.field == "i" else number & _BITS32, address)
-        ]
-        self._pairs.pack_into(self._view, 0, *flat)
+    def _buffer(self, name: str, value: Value, keep: list[object]) -> tuple[int, int]:
+        if not isinstance(value, bytes):
+            raise MessageError(f"{self.name}: {name} takes bytes, not {value!r}")
+        held = ffi.from_buffer("uint8_t[]", value)
+        keep.append(held)
+        return len(value), int(ffi.cast("uintptr_t", held))
 
-    def _argument(self, name: str, code: Code, value: Value, keep: list[object]) -> tuple[int, int]:
-        if code.wire_type == lib.WIRE_BYTES:
-            if not isinstance(value, bytes):
-                raise MessageError(f"{self.name}: {name} takes bytes, not {value!r}")
-            held = ffi.from_buffer("uint8_t[]", value)
-            keep.append(held)
-            return len(value), int(ffi.cast("uintptr_t", held))
+    def _number(self, name: str, code: Code, value: Value) -> int:
         if not isinstance(value, int):
             raise MessageError(f"{self.name}: {name} takes a number, not {value!r}")
         if not code.low <= value <= code.high:
             raise MessageError(f"{self.name}: {name}={value} is outside {code.low}..{code.high}")
-        return value, 0
+        return value
 
     def _mismatch(self, values: Mapping[str, Value]) -> str:
         missing = [name for name in self.names if name not in values]

@@ -62,7 +62,8 @@ class Link:
         data = self._ffi.from_buffer(content)
         kind = self._lib.LINK_BULK if bulk else self._lib.LINK_CONTROL
         status = self._lib.io_send(self._live(), self._number, kind, data, len(content), min_clock, req_clock)
-        self._check_command(status, len(content), "bulk" if bulk else "control")
+        if status != self._lib.IO_OK:
+            self._check_command(status, len(content), "bulk" if bulk else "control")
 
     def send_batch(self, batch: "Buffer") -> None:
         """Queue the motion commands of a batch (format: batch.h), all or none; raises LinkError as send()."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from nodes.support.errors import CanductorError
 
@@ -98,8 +98,7 @@ class BusDriver(Protocol):
         """End the driver and free the bus; nothing is called any more."""
 
 
-@dataclass(frozen=True, slots=True)
-class Response:
+class Response(NamedTuple):
     """One response of a node: the checked content of a block."""
 
     content: bytes

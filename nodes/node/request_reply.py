@@ -301,9 +301,13 @@ class RequestReply:
                 waiter.answered.set_result(Answer(message, *times, waiter.asked_bytes, len(response.content)))
                 break
         oid = message.params.get("oid")
-        for key in dict.fromkeys(((message.name, oid), (message.name, None))):
-            for callback in tuple(self._listeners.get(key, ())):  # type: ignore[arg-type]
-                callback(message)
+        if isinstance(oid, int):
+            self._call((message.name, oid), message)
+        self._call((message.name, None), message)
+
+    def _call(self, key: tuple[str, int | None], message: Message) -> None:
+        for callback in tuple(self._listeners.get(key, ())):
+            callback(message)
 
     def fail(self, error: CanductorError, *, shutdown: bool = False) -> None:
         """End all queries with ERROR; after a SHUTDOWN, only those that do not survive it."""

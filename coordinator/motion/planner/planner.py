@@ -53,6 +53,8 @@ AXIS_LETTERS = "XYZE"
 MOVE_LETTERS = "XYZEF"
 _STATUS = tuple(FeedStatus)
 MAX_ADVANCE_S: Final = 10.0
+_HOMED: Final = ("", "X", "Y", "XY", "Z", "XZ", "YZ", "XYZ")
+"""By the planner's mask."""
 EXTRUDER_LIMITS: Final = (
     "max_extrude_only_velocity",
     "max_extrude_only_accel",
@@ -245,9 +247,15 @@ class Planner:
     def gcode_position(self) -> Position:
         """Last target in the frame and units of the G-code program."""
         s = self._state
-        scale = (s.unit, s.unit, s.unit, s.unit * s.extrude_factor)
-        x, y, z, e = ((s.position[i] - s.base[i]) / scale[i] for i in range(4))
-        return (x, y, z, e)
+        x, y, z, e = s.position
+        base_x, base_y, base_z, base_e = s.base
+        unit = s.unit
+        return (
+            (x - base_x) / unit,
+            (y - base_y) / unit,
+            (z - base_z) / unit,
+            (e - base_e) / (unit * s.extrude_factor),
+        )
 
     @property
     def gcode_base(self) -> Position:
@@ -266,7 +274,7 @@ class Planner:
     @property
     def homed(self) -> str:
         """Letters of the homed axes; only these may move. E needs no homing."""
-        return "".join(letter for i, letter in enumerate("XYZ") if self._core.homed >> i & 1)
+        return _HOMED[self._core.homed & 0b111]
 
     @homed.setter
     def homed(self, axes: str) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps._steps import ffi, lib
@@ -41,6 +41,15 @@ class StepperStats:
     worst_error_s: float
     max_step_rate: float
     """Steps/s."""
+
+
+class Issued(NamedTuple):
+    """What the commands in batches amount to so far, for one stepper; see StepperStats."""
+
+    name: str
+    steps: int
+    issued: int
+    issued_clock: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,6 +324,15 @@ class StepGenerator:
     def stepper_stats(self) -> tuple[StepperStats, ...]:
         """Return the totals of every stepper."""
         return tuple(self._stepper_stats(i) for i in range(len(self._steppers)))
+
+    def issued(self) -> list[Issued]:
+        """Return the same of what is issued, in a fraction of the time."""
+        s: Any = ffi.new("struct step_stepper_stats *")
+        found = []
+        for index, stepper in enumerate(self._steppers):
+            lib.step_stepper_stats(self._gen, index, s)
+            found.append(Issued(stepper.name, s.steps, s.issued, s.issued_clock))
+        return found
 
     def _stepper_stats(self, index: int) -> StepperStats:
         self._check_stepper(index)
