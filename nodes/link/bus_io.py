@@ -1,6 +1,7 @@
 """Python wrapper of a bus's I/O thread (io_thread.h): links, raw frames, events in the asyncio loop."""
 
 import asyncio
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 from nodes.link.handle import BusHandle
@@ -203,12 +204,27 @@ class LinkIO:
         for frame in frames:
             if self._bus.open and self._on_frame:
                 self._on_frame(frame)
-        for number, batch in responses.items():
-            if link := self._links.get(number):
-                link.handle_responses(batch)
+        if taken > 1 and self._bus.open:
+            self._pass_on_together(responses)
+        else:
+            self._pass_on(responses)
         for notice in notices:
             if self._bus.open:
                 self._handle_notice(*notice)
+
+    def _pass_on_together(self, responses: Mapping[int, Sequence[Response]]) -> None:
+        """Do so; the commands that follow from them share blocks."""
+        self._lib.io_cork(self._bus.live(), 1)
+        try:
+            self._pass_on(responses)
+        finally:
+            if self._bus.open:
+                self._lib.io_cork(self._bus.live(), 0)
+
+    def _pass_on(self, responses: Mapping[int, Sequence[Response]]) -> None:
+        for number, batch in responses.items():
+            if link := self._links.get(number):
+                link.handle_responses(batch)
 
     def _handle_notice(self, notice: int, number: int, value: int) -> None:
         if notice == self._lib.IO_ENDED:

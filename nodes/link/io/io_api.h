@@ -44,6 +44,7 @@
 // IO_CONTROL_BYTES + IO_BULK_BYTES), nowhere else. Bounds, with L links of a bus:
 //
 //     io_send, io_send_urgent     the command's size, L, and what the driver's kick sends at once
+//     io_cork                     at its end, what the kick sends
 //     io_send_batch               the batch's size (it is checked, copied, noted for the forecast), L, and
 //                                 what the kick sends; when a queue is longer than ever, a copy of it
 //     io_take                     the room given
@@ -167,6 +168,10 @@ enum io_status io_let_wait(struct io_bus *bus, uint32_t number, const uint8_t *i
 
 // While HURRY is not 0 no response that is received waits.
 enum io_status io_hurry(struct io_bus *bus, uint32_t number, int hurry);
+
+// While CORKED is not 0, what io_send() queues is sent when the bus sends anyway, and at the latest at the
+// end: commands that are queued together share blocks.
+void io_cork(struct io_bus *bus, int corked);
 
 // Sets the bit rate of the bus if io_settings did not contain it, or a wrong one: budget and forecast start
 // again. 0: nothing is budgeted.

@@ -79,6 +79,8 @@ struct io_bus {
     unsigned allowed;                   // classes that may send, at the last io_next()
     uint64_t hold_ns;                   // when delayed data may be sent; UINT64_MAX: there is none
     double motion_bits, motion_content; // bits and bytes of motion so far, for the forecast
+    uint8_t corked;                     // what io_send() queues waits
+    uint8_t corked_waits;               // something does
     uint8_t noticed;                    // the driver was notified that io_take() has something
     uint64_t notice_ns;                 // when it is notified of what may wait; UINT64_MAX: nothing does
     uint8_t ended;                      // the transport has ended

@@ -84,12 +84,16 @@ static struct io_link *enter(struct io_bus *bus, uint32_t number, enum io_status
     return bus->links[at];
 }
 
-static enum io_status leave(struct io_bus *bus, enum io_status status) {
-    if (status == IO_OK)
-        bus->driver.kick(bus->context);
+static enum io_status leave_without_kick(struct io_bus *bus, enum io_status status) {
     io_publish(bus);
     io_unlock(bus);
     return status;
+}
+
+static enum io_status leave(struct io_bus *bus, enum io_status status) {
+    if (status == IO_OK)
+        bus->driver.kick(bus->context);
+    return leave_without_kick(bus, status);
 }
 
 static enum io_status from_link(enum link_status status) {
@@ -105,7 +109,19 @@ enum io_status io_send(struct io_bus *bus, uint32_t number, enum link_class kind
     if (node)
         status = from_link(
             link_send(&node->link, kind, content, size, min_clock, req_clock, bus->driver.now(bus->context)));
-    return leave(bus, status);
+    if (!bus->corked)
+        return leave(bus, status);
+    bus->corked_waits |= status == IO_OK;
+    return leave_without_kick(bus, status);
+}
+
+void io_cork(struct io_bus *bus, int corked) {
+    io_lock(bus);
+    bus->corked = corked != 0;
+    if (!corked && bus->corked_waits && !bus->ended)
+        bus->driver.kick(bus->context);
+    bus->corked_waits &= bus->corked;
+    leave_without_kick(bus, IO_OK);
 }
 
 enum io_status io_send_batch(struct io_bus *bus, uint32_t number, const uint8_t *batch, size_t size) {

@@ -224,6 +224,51 @@ static void each_call_says_what_became_of_it(void) {
     }
 }
 
+static void send_query(struct io_bus *bus, uint32_t number, enum io_status expected, int kicks) {
+    size_t size = expected == IO_INVALID ? 0 : sizeof query;
+    CHECK_EQUAL(io_send(bus, number, LINK_CONTROL, query, size, 0, 0), expected);
+    CHECK_EQUAL(scene.kicks, kicks);
+}
+
+static void what_is_corked_is_sent_together_at_the_end(void) {
+    struct io_bus *bus = begin(IO_BYTES, &unknown_speed);
+    uint32_t number = open_link(bus, 0);
+    uint8_t out[1024];
+    io_cork(bus, 2); // any number but 0
+    send_query(bus, number, IO_OK, 0);
+    send_query(bus, number, IO_OK, 0);
+    CHECK_EQUAL(link_stats(bus, number).pending, 2); // it shows at once
+    io_cork(bus, 0);
+    CHECK_EQUAL(scene.kicks, 1);
+    while (io_next(bus, scene.now_ns, 0, out, sizeof out))
+        ;
+    io_handle_time(bus, scene.now_ns); // so that it shows
+    CHECK_EQUAL(link_stats(bus, number).in_flight_blocks, 1);
+    io_cork(bus, 0); // again: there is nothing to send
+    CHECK_EQUAL(scene.kicks, 1);
+    send_query(bus, number, IO_OK, 2);
+    io_free(bus);
+}
+
+static void a_cork_holds_back_only_what_io_send_takes(void) {
+    struct io_bus *bus = begin(IO_CAN_STREAM, &unknown_speed);
+    uint32_t number = open_link(bus, NODE);
+    io_cork(bus, 1);
+    send_query(bus, number, IO_INVALID, 0);
+    io_cork(bus, 0);
+    CHECK_EQUAL(scene.kicks, 0); // nothing was taken
+    io_cork(bus, 1);
+    send_query(bus, number, IO_OK, 0);
+    for (int call = BATCH; call < CALLS; call++) {
+        CHECK_EQUAL(make_call(bus, number, (enum call)call, 1), IO_OK);
+        CHECK_EQUAL(scene.kicks, call - SEND);
+    }
+    io_end(bus, 0);
+    io_cork(bus, 0);
+    CHECK_EQUAL(scene.kicks, CALLS - 1 - SEND); // there is nowhere to send it to
+    io_free(bus);
+}
+
 static void a_lost_link_takes_no_commands(void) {
     struct io_bus *bus = begin(IO_CAN_STREAM, &unknown_speed);
     uint32_t number = open_link(bus, NODE);
@@ -413,6 +458,8 @@ int main(void) {
     links_come_and_go_in_any_order();
     a_line_may_be_known_from_the_start();
     each_call_says_what_became_of_it();
+    what_is_corked_is_sent_together_at_the_end();
+    a_cork_holds_back_only_what_io_send_takes();
     a_lost_link_takes_no_commands();
     queues_are_as_long_as_they_should_be();
     urgent_commands_empty_the_forecast();

@@ -5,15 +5,16 @@ import errno
 import gc
 import struct
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from nodes.link import Link, LinkError, LinkIO, LinkSettings, LinkStats
+from nodes.link import Link, LinkError, LinkIO, LinkSettings, LinkStats, Response
 from nodes.link._link import ffi, lib
 from nodes.link.handle import BusHandle
+from nodes.link.interfaces import OnResponses
 from tests.nodes.link.by_hand import START_NS, ByHand
 from tests.nodes.link.peers import Inbox
 from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, store
@@ -34,14 +35,14 @@ def record(command: bytes, min_clock: int = 0, req_clock: int = 0) -> bytes:
 class Line:
     """One link on a serial line by hand, and its node."""
 
-    def __init__(self, *, lost_after_s: float = 1.0) -> None:
+    def __init__(self, *, lost_after_s: float = 1.0, on_responses: OnResponses | None = None) -> None:
         self.driver = ByHand()
         self.inbox = Inbox()
         self.node = NodeTwin()
         self.io = LinkIO.driven_by(self.driver, on_closed=self.inbox.on_closed)
         self.link: Link = self.io.open_link(
             LinkSettings(None, lost_after_s=lost_after_s),
-            on_responses=self.inbox.on_responses,
+            on_responses=on_responses or self.inbox.on_responses,
             on_lost=self.inbox.on_lost,
         )
 
@@ -432,3 +433,46 @@ def test_responses_are_handed_over_with_their_times() -> None:
     assert response.content == answer(7)
     assert response.sent_ns == asked_ns
     assert START_NS < asked_ns < response.received_ns <= line.driver.now
+
+
+def test_commands_that_follow_from_what_came_together_share_a_block() -> None:
+    came: list[Sequence[Response]] = []
+
+    def store_each(responses: Sequence[Response]) -> None:
+        came.append(responses)
+        for number in range(len(responses)):
+            line.link.send(store(number))
+
+    line = Line(on_responses=store_each).connected()
+    for number in (7, 8):
+        line.link.send(ask(number))
+    line.drain()
+    assert [len(responses) for responses in came] == [2]
+    blocks = line.link.stats().control.blocks
+    line.drain()
+    assert line.node.executed[-2:] == [store(0), store(1)]
+    assert line.link.stats().control.blocks == blocks + 1
+
+
+def test_what_a_callback_sends_is_sent_though_it_fails_or_closes_the_bus() -> None:
+    closes = False
+
+    def store_and_fail(_: Sequence[Response]) -> None:
+        line.link.send(store(3))
+        if closes:
+            line.io.close()
+        raise ZeroDivisionError
+
+    line = Line(on_responses=store_and_fail).connected()
+    for number in (7, 8):
+        line.link.send(ask(number))
+    with pytest.raises(ZeroDivisionError):
+        line.drain()
+    line.drain()
+    assert line.node.executed[-1] == store(3)
+    closes = True
+    for number in (7, 8):
+        line.link.send(ask(number))
+    with pytest.raises(ZeroDivisionError):
+        line.drain()
+    assert not line.io._bus.open
