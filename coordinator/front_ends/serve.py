@@ -33,6 +33,7 @@ from coordinator.service.core.machine_service import MachineService, ServiceSett
 from coordinator.service.core.typed import Typed
 from coordinator.service.state.log_ring import Entry
 from coordinator.support.interrupts import run_to_end
+from coordinator.support.locked_memory import lock_memory
 from coordinator.support.loop_watchdog import WatchedLoop
 from coordinator.support.report import PlainReport, Report
 from coordinator.support.time_slice import shorten_time_slice
@@ -105,6 +106,7 @@ def serve(
     """Serve the machine that LOAD describes; raises as ``serve_machine``."""
     raise_files_limit()
     shorten_time_slice()
+    lock_memory()
     process = _ServiceProcess(load, options, cache)
     try:
         run_to_end(process.serve, WatchedLoop)

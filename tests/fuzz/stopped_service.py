@@ -22,6 +22,7 @@ from coordinator.ipc.server.uploads import upload_method
 from coordinator.serial_host.terminal import PseudoTerminal
 from coordinator.service.api.methods import add_methods
 from coordinator.service.state.log_ring import Entry
+from coordinator.support.locked_memory import lock_memory
 from coordinator.support.time_slice import shorten_time_slice
 from coordinator.web.server import WebServer
 from coordinator.web.settings import WebSettings
@@ -98,6 +99,7 @@ def main() -> None:
     """Serve, and hold the loop as standard input says."""
     commands, answers = sys.stdin, sys.stdout
     shorten_time_slice()
+    lock_memory()
 
     def say(line: str) -> None:
         answers.write(line + "\n")

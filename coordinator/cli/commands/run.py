@@ -19,6 +19,7 @@ from coordinator.service.core.job_runner import run_job
 from coordinator.service.jobs.outcome import NodeOutcome, Outcome
 from coordinator.support.examples import machine_name
 from coordinator.support.interrupts import run_to_end
+from coordinator.support.locked_memory import lock_memory
 from coordinator.support.progress import Progress, ProgressDisplay
 from coordinator.support.report import Report
 from coordinator.support.time_slice import shorten_time_slice
@@ -140,6 +141,7 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
         _announce(description)
         show = stack.enter_context(_progress(options, program))
         shorten_time_slice()
+        lock_memory()
         outcome = run_to_end(
             lambda: run_job(
                 description,
