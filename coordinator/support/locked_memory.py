@@ -1,7 +1,7 @@
 """Keeps what this process uses in memory, however long it rests.
 
-A system that is short of memory takes away pages that were not used for a while, code first, since that is on
-the disk. Whoever needs them again waits for it, and an emergency stop is mostly what was not used for a while.
+A system that is short of memory takes away pages that were not used for a while, code first, since that is
+on the disk. Whoever needs them again waits for it, and an emergency stop was mostly not used for a while.
 """
 
 import ctypes
