@@ -213,7 +213,7 @@ class LinkIO:
                 self._handle_notice(*notice)
 
     def _pass_on_together(self, responses: Mapping[int, Sequence[Response]]) -> None:
-        """Do so; the commands that follow from them share blocks."""
+        """Pass RESPONSES on so that the commands that follow from them share blocks."""
         self._lib.io_cork(self._bus.live(), 1)
         try:
             self._pass_on(responses)

@@ -62,9 +62,13 @@ class WorkThread:
     def _run(self) -> None:
         while (work := self._waiting.get()) is not None:
             call, args, done = work
-            result, failure = None, None
+            result: Any = None
+            failure: BaseException | None = None
             try:
                 result = call(*args)
+            except StopIteration as error:  # a future cannot carry it
+                failure = RuntimeError(f"{self._name}: StopIteration was not caught")
+                failure.__cause__ = error
             except BaseException as error:  # noqa: BLE001 (it belongs to who waits)
                 failure = error
             self._loop.call_soon_threadsafe(_settle, done, result, failure)

@@ -141,7 +141,7 @@ class Recovery:
         self._journal: Journal | None = None
         self._job: JobRun | None = None
         self._kept: _Kept | None = None
-        """Of the machine that does it."""
+        """Of the machine that carries out the job."""
         self._noted_s = 0.0
         self._heights_noted: tuple[float, float] | None = None
         self._last: Interrupted | None = None
@@ -195,7 +195,7 @@ class Recovery:
         if job is None or journal is None:
             return
         if not job.active:
-            self._job = None
+            self._job = self._kept = None
             if job.phase in _FORGOTTEN:
                 journal.end()
             else:

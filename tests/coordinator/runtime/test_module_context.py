@@ -37,7 +37,7 @@ class Calls:
 
 
 def run(check: Callable[[ModuleContext], Awaitable[None]]) -> list[dict[str, Any]]:
-    """Run CHECK with a context, begun at a multiple of a second; return what the loop was told."""
+    """Run CHECK with a context, begun at a multiple of a second; return the errors that were reported."""
     failures: list[dict[str, Any]] = []
     primary, other = Clock(), Clock()
     nodes = {"mcu": SimpleNamespace(best_clock=primary), "toolhead": SimpleNamespace(best_clock=other)}
@@ -108,7 +108,7 @@ def test_the_last_one_that_ends_ends_all_and_another_begins_anew() -> None:
     assert run(check) == []
 
 
-def test_one_that_fails_is_told_and_the_others_are_called() -> None:
+def test_one_that_fails_is_reported_and_the_others_are_called() -> None:
     async def check(live: ModuleContext) -> None:
         calls = Calls()
         live.every(1.0, lambda: cast("None", 1 / 0))
@@ -116,8 +116,8 @@ def test_one_that_fails_is_told_and_the_others_are_called() -> None:
         await asyncio.sleep(2.5)
         assert calls.came_s == [1.0, 2.0]
 
-    told = run(check)
-    assert [type(context["exception"]) for context in told] == [ZeroDivisionError] * 2
+    reported = run(check)
+    assert [type(context["exception"]) for context in reported] == [ZeroDivisionError] * 2
 
 
 def test_once_is_once_at_the_earlier_time_unless_it_is_cancelled() -> None:

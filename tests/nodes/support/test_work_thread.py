@@ -37,6 +37,15 @@ def test_what_the_work_raises_is_raised_and_the_thread_goes_on() -> None:
     assert asyncio.run(main()) == 4
 
 
+def test_an_exception_that_no_future_carries_hangs_nobody() -> None:
+    async def main() -> None:
+        with WorkThread("motion") as thread:
+            with pytest.raises(RuntimeError, match="motion: StopIteration was not caught"):
+                await thread.run(next, iter(()))
+
+    asyncio.run(main())
+
+
 def test_a_block_that_is_left_waits_for_work_that_was_begun() -> None:
     begun, go_on = threading.Event(), threading.Event()
     finished = []
