@@ -326,7 +326,7 @@ class StepGenerator:
         return tuple(self._stepper_stats(i) for i in range(len(self._steppers)))
 
     def issued(self) -> list[Issued]:
-        """Return what is issued, of every stepper: for each cycle of a print, where all totals take longer."""
+        """Return what is issued, of every stepper: for each cycle of a print, where all totals cost more."""
         s: Any = ffi.new("struct step_stepper_stats *")
         found = []
         for index, stepper in enumerate(self._steppers):

@@ -39,9 +39,9 @@ def test_what_the_work_raises_is_raised_and_the_thread_goes_on() -> None:
 
 def test_an_exception_that_no_future_carries_hangs_nobody() -> None:
     async def main() -> None:
-        with WorkThread("motion") as thread:
-            with pytest.raises(RuntimeError, match="motion: StopIteration was not caught"):
-                await thread.run(next, iter(()))
+        failure = pytest.raises(RuntimeError, match="motion: StopIteration was not caught")
+        with WorkThread("motion") as thread, failure:
+            await thread.run(next, iter(()))
 
     asyncio.run(main())
 
