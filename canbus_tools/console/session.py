@@ -94,7 +94,7 @@ class Session:
         self._asked = _text_of(command)
         try:
             if answer is None:
-                self.talk.link.send(self.talk.encode(command.name, **values))
+                self.talk.link.send(self.talk.encode(command.name, values))
                 await self.talk.drained()
             elif may_repeat(command.name):
                 await self.talk.ask(command.name, answer, values)

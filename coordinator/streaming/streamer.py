@@ -27,7 +27,10 @@ CYCLE_S: Final = 0.05
 FULL_CYCLE_S: Final = 0.6
 """While planner and commands reach as far ahead as they may; taken off the lead of SEND_AHEAD_S."""
 FULL_EARLY_S: Final = 0.1
-"""So much earlier it comes when the loop is awake anyway, as for sensors, which report every 0.3 s."""
+"""So much earlier it comes when the loop is awake anyway."""
+ALONE_EARLY_S: Final = 0.3
+"""The same after a cycle that woke the loop itself: sensors report that often, and what comes with a report once
+goes on to come with reports."""
 BUSY_CYCLE_S: Final = 0.4
 """The same on a busy bus: that it cannot carry the plan has to be found in time."""
 REST_CYCLE_S: Final = 1.0
@@ -86,6 +89,8 @@ class Streamer:
         """Whether a bus is busy, as of the last cycle."""
         self._pause: asyncio.Future[None] | None = None
         """Between two cycles."""
+        self._alone = False
+        """Whether nothing else was to be done when the last pause ended."""
         self.cycles = 0
         """So far."""
         self._witness = witness
@@ -224,13 +229,16 @@ class Streamer:
         ends_s = loop.time() + pause_s
         if pause_s == REST_CYCLE_S:  # together with the timers of modules
             ends_s = math.floor(ends_s / pause_s) * pause_s
-        early_s = FULL_EARLY_S if pause_s == FULL_CYCLE_S else 0.0
+        early_s = 0.0
+        if pause_s == FULL_CYCLE_S:
+            early_s = ALONE_EARLY_S if self._alone else FULL_EARLY_S
         cancel = call_between(ends_s - early_s, ends_s, self._end_pause)
         try:
             await self._pause
         finally:
             cancel()
             self._pause = None
+        self._alone = loop.time() >= ends_s
         self._rested = pause_s == REST_CYCLE_S and not self._called and self._at_rest()
 
     def _end_pause(self) -> None:

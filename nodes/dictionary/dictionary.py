@@ -204,10 +204,10 @@ class Dictionary:
 
 def encode_values(dictionary: Dictionary, command: MessageFormat, values: Mapping[str, Value | str]) -> bytes:
     """Encode COMMAND with enumeration names resolved; MessageError."""
-    resolved: dict[str, Value] = {}
     for param, value in values.items():
-        resolved[param] = _resolved(dictionary, command, param, value) if isinstance(value, str) else value
-    return command.encode(resolved)
+        if isinstance(value, str):
+            values = {**values, param: _resolved(dictionary, command, param, value)}
+    return command.encode(values)
 
 
 def _resolved(dictionary: Dictionary, command: MessageFormat, param: str, name: str) -> int:

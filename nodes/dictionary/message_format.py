@@ -21,6 +21,8 @@ CONTENT_MAX: Final[int] = lib.WIRE_CONTENT_MAX
 MAX_PARAMETERS: Final = 32
 NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _BITS32: Final = 0xFFFFFFFF
+_ALL: Final = -1
+"""All bits of a number, whatever its sign."""
 _BYTES: Final[int] = lib.WIRE_BYTES
 
 
@@ -108,6 +110,11 @@ class MessageFormat:
         self.message_id = message_id
         self.names = tuple(names)
         self._known = frozenset(names)
+        self._fields = tuple(
+            (name, code.wire_type == _BYTES, code.low, code.high, _ALL if code.field == "i" else _BITS32)
+            for name, code in zip(self.names, (CODES[code] for code in codes), strict=True)
+        )
+        """Of each parameter the name, whether it is a buffer, the range, and the bits that C gets."""
         self.codes = tuple(CODES[code] for code in codes)
         self.code_texts = tuple(codes)
         self._count = len(self.names)
@@ -134,21 +141,22 @@ class MessageFormat:
 
     # ---------------------------------------------------------------------------------------------- encode
 
-    def encode(self, values: Mapping[str, Value]) -> bytes:
-        """Encode the message, id included; MessageError when VALUES do not fit it."""
-        if values.keys() != self._known:
+    def encode(self, values: Mapping[str, Value | str]) -> bytes:
+        """Encode the message, id included; MessageError when VALUES do not fit it, as no text does."""
+        if len(values) != self._count or not self._known.issuperset(values):
             raise MessageError(self._mismatch(values))
         if not self._count:
             return self.prefix
         pairs: list[int] = []
         keep: list[object] = []  # what the addresses point into
-        for name, code in zip(self.names, self.codes, strict=True):
+        for name, is_buffer, low, high, bits in self._fields:
             value = values[name]
-            if code.wire_type == _BYTES:
+            if is_buffer:
                 pairs += self._buffer(name, value, keep)
+            elif isinstance(value, int) and low <= value <= high:
+                pairs += (value & bits, 0)
             else:
-                number = self._number(name, code, value)
-                pairs += (number if code.field == "i" else number & _BITS32, 0)
+                raise MessageError(self._unfit(name, value, low, high))
         self._pairs.pack_into(self._view, 0, *pairs)
         used: int = lib.wire_pack(self._types, self._count, self._args, self._out, self._content_max)
         if not used:
@@ -157,21 +165,19 @@ class MessageFormat:
             )
         return self.prefix + self._room[:used].tobytes()
 
-    def _buffer(self, name: str, value: Value, keep: list[object]) -> tuple[int, int]:
+    def _buffer(self, name: str, value: Value | str, keep: list[object]) -> tuple[int, int]:
         if not isinstance(value, bytes):
             raise MessageError(f"{self.name}: {name} takes bytes, not {value!r}")
         held = ffi.from_buffer("uint8_t[]", value)
         keep.append(held)
         return len(value), int(ffi.cast("uintptr_t", held))
 
-    def _number(self, name: str, code: Code, value: Value) -> int:
+    def _unfit(self, name: str, value: Value | str, low: int, high: int) -> str:
         if not isinstance(value, int):
-            raise MessageError(f"{self.name}: {name} takes a number, not {value!r}")
-        if not code.low <= value <= code.high:
-            raise MessageError(f"{self.name}: {name}={value} is outside {code.low}..{code.high}")
-        return value
+            return f"{self.name}: {name} takes a number, not {value!r}"
+        return f"{self.name}: {name}={value} is outside {low}..{high}"
 
-    def _mismatch(self, values: Mapping[str, Value]) -> str:
+    def _mismatch(self, values: Mapping[str, Value | str]) -> str:
         missing = [name for name in self.names if name not in values]
         unknown = [name for name in values if name not in self.names]
         faults = [

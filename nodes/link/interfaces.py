@@ -25,7 +25,7 @@ class LinkInterface(Protocol):
     def send_urgent(self, content: bytes) -> None: ...  # noqa: D102
     def set_receive_window(self, size: int, /) -> None: ...  # noqa: D102
     def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None: ...  # noqa: D102
-    def let_wait(self, message_id: bytes, seconds: float, /) -> None: ...  # noqa: D102
+    def let_wait(self, message_id: bytes, seconds: float, together: int = 0, /) -> None: ...  # noqa: D102
     def hurry(self, *, hurry: bool) -> None: ...  # noqa: D102
     def take(self) -> None: ...  # noqa: D102
     async def drained(self) -> None: ...  # noqa: D102

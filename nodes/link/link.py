@@ -107,13 +107,16 @@ class Link:
             )
         self._check(self._lib.io_set_clock(self._live(), self._number, freq_hz, at_ns, at_ticks))
 
-    def let_wait(self, message_id: bytes, seconds: float) -> None:
+    def let_wait(self, message_id: bytes, seconds: float, together: int = 0) -> None:
         """From now on let responses with MESSAGE_ID (as on the wire) wait for others, up to SECONDS; 0: not.
 
-        What may wait wakes the loop only when it has waited. Raises LinkError when too many may.
+        What may wait wakes the loop only when it has waited, or when TOGETHER of them are there (0: not for
+        their number). Raises LinkError when too many may.
         """
         content, wait_ns = self._ffi.from_buffer(message_id), round(seconds * 1e9)
-        status = self._lib.io_let_wait(self._live(), self._number, content, len(message_id), wait_ns)
+        status = self._lib.io_let_wait(
+            self._live(), self._number, content, len(message_id), wait_ns, together
+        )
         if status in (self._lib.IO_FULL, self._lib.IO_INVALID):
             raise LinkError(f"{self._name}: no room to let responses with the id {message_id.hex()} wait")
         self._check(status)

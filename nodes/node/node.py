@@ -188,7 +188,7 @@ class Node:
     def send(self, name: str, /, *, min_clock: int = 0, req_clock: int = 0, **args: Value | str) -> None:
         """Send a command (clocks: ``nodes/link/core/batch.h``); NodeError when the node cannot take it."""
         self._check_usable()
-        self._talk.send(name, min_clock=min_clock, req_clock=req_clock, **args)
+        self._talk.send(name, args, min_clock=min_clock, req_clock=req_clock)
 
     async def query(
         self,
@@ -222,7 +222,8 @@ class Node:
         """
         with contextlib.suppress(CanductorError):  # there is no link, or it is lost
             for response, rests in {MEASURED: measurements, **dict.fromkeys(STATE, state)}.items():
-                self._talk.let_wait(response, REST_PATIENCE_S if rests else PATIENCE_S[response])
+                seconds = REST_PATIENCE_S if rests else PATIENCE_S[response]
+                self._talk.let_wait(response, seconds, in_step=response == MEASURED and not rests)
         if self._keeper is not None:
             self._keeper.rests = clock
 
@@ -429,7 +430,7 @@ class Node:
         if not self.kept_configuration:
             for command in wanted.config_commands:
                 self._talk.send_text(command)
-            self._talk.send("finalize_config", crc=wanted.crc)
+            self._talk.send("finalize_config", {"crc": wanted.crc})
             found = await self._finalized()
         self._check_configured(found, wanted)
         self.move_count = found.integer("move_count")

@@ -7,9 +7,10 @@ import asyncio
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
+from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary, encode_values
 from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value
 from nodes.link.interfaces import LinkInterface
 from nodes.link.types import Response
@@ -18,6 +19,7 @@ from nodes.support.errors import CanductorError
 QUERY_TIMEOUT_S: Final = 0.25
 QUERY_TRIES: Final = 12
 """On a bus that loses one frame in ten, every third answer does not arrive: one query in 500,000 fails."""
+_NO_ARGS: Final[Mapping[str, Value | str]] = MappingProxyType({})
 MAX_WAITERS: Final = 256
 """Most queries in flight at once; more is a programming error, not load."""
 
@@ -148,15 +150,24 @@ class RequestReply:
             raise QueryTimeout(f"node {self.name} has no connection")
         return self._link
 
-    def let_wait(self, response: str, seconds: float) -> None:
+    def let_wait(self, response: str, seconds: float, *, in_step: bool = False) -> None:
         """Let RESPONSE, if the firmware has it, wait for others up to SECONDS while nobody is in a hurry.
 
-        A program that is woken for each single one does little else. Ends with the link.
+        IN_STEP: until there is one of each oid that somebody listens for, which send it at the same time. A
+        program that is woken for each single one does little else. Ends with the link.
         """
         known = self.dictionary.responses.get(response)
         if known is not None and self._patience_s.get(response, 0.0) != seconds:
             self._patience_s[response] = seconds
-            self.link.let_wait(known.prefix, seconds)
+            together = self._senders(response) if in_step else 0
+            self.link.let_wait(known.prefix, seconds, together)
+
+    def _senders(self, response: str) -> int:
+        """Return of how many oids somebody listens for RESPONSE now."""
+        return sum(
+            name == response and oid is not None and bool(callbacks)
+            for (name, oid), callbacks in self._listeners.items()
+        )
 
     @contextmanager
     def _hurrying(self) -> Iterator[None]:
@@ -176,9 +187,11 @@ class RequestReply:
 
     # ------------------------------------------------------------------------------------------------ send
 
-    def send(self, name: str, /, *, min_clock: int = 0, req_clock: int = 0, **args: Value | str) -> None:
-        """Send a command; clocks as in ``nodes/link/core/batch.h``. Raises MessageError."""
-        self.link.send(self.encode(name, **args), min_clock=min_clock, req_clock=req_clock)
+    def send(
+        self, name: str, args: Mapping[str, Value | str] = _NO_ARGS, *, min_clock: int = 0, req_clock: int = 0
+    ) -> None:
+        """Send a command with ARGS; clocks as in ``nodes/link/core/batch.h``. Raises MessageError."""
+        self.link.send(self.encode(name, args), min_clock=min_clock, req_clock=req_clock)
 
     def send_text(self, command: str) -> None:
         """Send a command written as text; raises MessageError."""
@@ -187,10 +200,10 @@ class RequestReply:
         except MessageError as error:
             raise MessageError(f"node {self.name}: {error}") from None
 
-    def encode(self, name: str, /, **args: Value | str) -> bytes:
-        """Encode a command; the MessageError names the node."""
+    def encode(self, name: str, args: Mapping[str, Value | str] = _NO_ARGS) -> bytes:
+        """Encode a command with ARGS; the MessageError names the node."""
         try:
-            return self.dictionary.encode(name, **args)
+            return encode_values(self.dictionary, self.dictionary.command(name), args)
         except MessageError as error:
             raise MessageError(f"node {self.name}: {error}") from None
 
@@ -198,7 +211,7 @@ class RequestReply:
         self,
         name: str,
         response: str,
-        args: Mapping[str, Value | str] | None = None,
+        args: Mapping[str, Value | str] = _NO_ARGS,
         *,
         matching: Mapping[str, Value] | None = None,
         timeout_s: float = QUERY_TIMEOUT_S,
@@ -212,8 +225,7 @@ class RequestReply:
         and any error given to ``fail`` meanwhile. With SURVIVES_SHUTDOWN a shutdown does not end the wait. A
         PATIENT question has time: its answer may come as late as those of ``let_wait``.
         """
-        args = args or {}
-        content = self.encode(name, **args)
+        content = self.encode(name, args)
         format_ = self._response_to(name, response)
         if matching is None:
             matching = {"oid": args["oid"]} if "oid" in args and "oid" in format_.names else {}  # type: ignore[dict-item]

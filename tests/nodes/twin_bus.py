@@ -193,6 +193,7 @@ class TwinLink:
         self.sent: list[tuple[bytes, int, int]] = []
         self.on_silent: Callable[[], None] = lambda: None
         self.patience_s: dict[bytes, float] = {}
+        self.together: dict[bytes, int] = {}
         self.hurries: list[bool] = []
         self.waiting: deque[Response] = deque()
         """What has arrived and is handed over when it is asked for."""
@@ -248,9 +249,10 @@ class TwinLink:
     def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None:
         self.clocks.append((freq_hz, at_ns, at_ticks))
 
-    def let_wait(self, message_id: bytes, seconds: float) -> None:
+    def let_wait(self, message_id: bytes, seconds: float, together: int = 0) -> None:
         self._check()
         self.patience_s[message_id] = seconds
+        self.together[message_id] = together
 
     def hurry(self, *, hurry: bool) -> None:
         self._check()

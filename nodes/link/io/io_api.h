@@ -161,10 +161,11 @@ enum io_status io_set_clock(struct io_bus *bus, uint32_t number, double freq_hz,
                             uint64_t at_ticks);
 
 // From now on responses that begin with the message id ID may wait for others, for WAIT_NS at most: the
-// driver does not notify of them alone before. 0: they may not, as at first. IO_INVALID: no id; IO_FULL: too
-// many.
+// driver does not notify of them alone before. 0: they may not, as at first. When TOGETHER of them wait, no
+// other is expected, and the driver notifies; 0: it is not known how many come together. IO_INVALID: no id;
+// IO_FULL: too many.
 enum io_status io_let_wait(struct io_bus *bus, uint32_t number, const uint8_t *id, size_t size,
-                           uint64_t wait_ns);
+                           uint64_t wait_ns, uint32_t together);
 
 // While HURRY is not 0 no response that is received waits.
 enum io_status io_hurry(struct io_bus *bus, uint32_t number, int hurry);

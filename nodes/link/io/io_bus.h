@@ -29,7 +29,10 @@ struct io_segment {
 // Responses that begin with an id and may wait.
 struct io_patience {
     uint8_t id[IO_ID_MAX], size;
-    uint64_t wait_ns; // for so long
+    uint64_t wait_ns;  // for so long
+    uint32_t together; // notify when so many wait; 0: not for their number
+    uint32_t waiting;  // so many do, of those that came after
+    uint64_t takes;    // this number of io_take()
 };
 
 // Published counters, read without a lock: SEQUENCE is odd while they are written.
@@ -82,6 +85,7 @@ struct io_bus {
     uint8_t corked;                     // what io_send() queues waits
     uint8_t corked_waits;               // something does
     uint8_t noticed;                    // the driver was notified that io_take() has something
+    uint64_t takes;                     // how often io_take() has returned everything
     uint64_t notice_ns;                 // when it is notified of what may wait; UINT64_MAX: nothing does
     uint8_t ended;                      // the transport has ended
     uint8_t ended_pending;              // an IO_ENDED is due

@@ -213,6 +213,7 @@ size_t io_take(struct io_bus *bus, struct io_event *out, size_t room) {
     io_publish(bus);
     if (taken < room) { // also without a notice: that of what is taken already may come late
         bus->noticed = 0;
+        bus->takes++;
         set_notice(bus, UINT64_MAX);
         if (bus->driver.quiet)
             bus->driver.quiet(bus->context);

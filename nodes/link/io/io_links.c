@@ -173,14 +173,15 @@ static struct io_patience *place_of(struct io_link *node, const uint8_t *id, siz
 }
 
 enum io_status io_let_wait(struct io_bus *bus, uint32_t number, const uint8_t *id, size_t size,
-                           uint64_t wait_ns) {
+                           uint64_t wait_ns, uint32_t together) {
     if (size == 0 || size > IO_ID_MAX)
         return IO_INVALID;
     enum io_status status;
     struct io_link *node = enter(bus, number, &status);
     struct io_patience *patience = node ? place_of(node, id, size) : NULL;
     if (patience) {
-        *patience = (struct io_patience){.size = wait_ns ? (uint8_t)size : 0, .wait_ns = wait_ns};
+        *patience = (struct io_patience){
+            .size = wait_ns ? (uint8_t)size : 0, .wait_ns = wait_ns, .together = together};
         memcpy(patience->id, id, size);
     } else if (node) {
         status = IO_FULL;

@@ -6,13 +6,22 @@
 
 enum { FROM_NODE = 1 };
 
+// Counts one more that waits; returns whether all that come together do.
+static int completes(const struct io_bus *bus, struct io_patience *patience) {
+    if (patience->takes != bus->takes)
+        patience->waiting = 0;
+    patience->takes = bus->takes;
+    return ++patience->waiting == patience->together;
+}
+
 // How long a response may wait for others.
-static uint64_t patience_with(const struct io_link *node, const struct link_response *response) {
+static uint64_t patience_with(const struct io_bus *bus, struct io_link *node,
+                              const struct link_response *response) {
     for (size_t i = 0; i < IO_PATIENT_MAX && !node->in_a_hurry; i++) {
-        const struct io_patience *patience = &node->patience[i];
+        struct io_patience *patience = &node->patience[i];
         if (patience->size && patience->size <= response->size &&
             memcmp(response->content, patience->id, patience->size) == 0)
-            return patience->wait_ns;
+            return completes(bus, patience) ? 0 : patience->wait_ns;
     }
     return 0;
 }
@@ -27,7 +36,7 @@ void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, s
         event.received_ns = response.received_ns;
         memcpy(event.content, response.content, response.size);
         io_push(&bus->responses, &event, &bus->stats.responses_dropped, &bus->stats.responses_max);
-        io_notify_by(bus, now, patience_with(node, &response));
+        io_notify_by(bus, now, patience_with(bus, node, &response));
     }
     node->changed |=
         node->link.rx_used != waiting; // also without new bytes: an incomplete block may have been given up

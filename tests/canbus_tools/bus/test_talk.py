@@ -42,7 +42,7 @@ def test_a_node_is_asked_and_told_things_and_everything_it_says_is_seen(six: Six
                     came.set()
 
             end = node.on_message(note)
-            node.send("debug_ping", data=b"hello")
+            node.send("debug_ping", {"data": b"hello"})
             await came.wait()
             assert [message.data("data") for message in seen] == [b"hello"]
             end()

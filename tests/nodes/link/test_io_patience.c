@@ -25,7 +25,11 @@ static void other_says(struct scene *scene, const uint8_t *content, size_t size)
 }
 
 static void let_wait(struct scene *scene, const uint8_t *id, size_t size, uint64_t wait_ns) {
-    CHECK_EQUAL(io_let_wait(scene->bus, scene->link, id, size, wait_ns), IO_OK);
+    CHECK_EQUAL(io_let_wait(scene->bus, scene->link, id, size, wait_ns, 0), IO_OK);
+}
+
+static void let_wait_together(struct scene *scene, uint32_t together) {
+    CHECK_EQUAL(io_let_wait(scene->bus, scene->link, short_id, 1, 100 * MS, together), IO_OK);
 }
 
 static void check_waits(struct scene *scene, int notices, uint64_t left_ns) {
@@ -109,6 +113,41 @@ static void what_may_not_wait_is_told_at_once_and_takes_it_along(void) {
     }
 }
 
+static void all_that_come_together_are_told_at_once(void) {
+    struct scene scene;
+    begin(&scene);
+    let_wait_together(&scene, 3);
+    for (int round = 1; round <= 3; round++) {
+        answer(&scene, short_id, 1);
+        answer(&scene, short_id, 1);
+        check_waits(&scene, round - 1, 100 * MS);
+        answer(&scene, short_id, 1);
+        check_told(&scene, round);
+        CHECK_EQUAL(take(&scene), 3);
+    }
+    io_free(scene.bus);
+}
+
+static void what_was_taken_does_not_count_among_those_that_wait(void) {
+    struct scene scene;
+    begin(&scene);
+    let_wait_together(&scene, 2);
+    answer(&scene, short_id, 1);
+    CHECK_EQUAL(take(&scene), 1);
+    answer(&scene, short_id, 1);
+    check_waits(&scene, 0, 100 * MS);
+    answer(&scene, short_id, 1);
+    check_told(&scene, 1);
+    answer(&scene, short_id, 1); // one more than expected
+    check_told(&scene, 1);
+    CHECK_EQUAL(take(&scene), 3);
+    let_wait_together(&scene, 0);
+    for (int i = 0; i < 5; i++)
+        answer(&scene, short_id, 1);
+    check_waits(&scene, 1, 100 * MS);
+    io_free(scene.bus);
+}
+
 static void ids_are_compared_whole(void) {
     struct scene scene;
     const uint8_t with_values[] = {0x81, 0x12, 7};
@@ -161,7 +200,7 @@ static void nothing_waits_in_a_hurry(void) {
     begin(&scene);
     let_wait(&scene, short_id, 1, 100 * MS);
     open_other(&scene, &other);
-    CHECK_EQUAL(io_let_wait(scene.bus, other, short_id, 1, 100 * MS), IO_OK);
+    CHECK_EQUAL(io_let_wait(scene.bus, other, short_id, 1, 100 * MS, 0), IO_OK);
     CHECK_EQUAL(io_hurry(scene.bus, scene.link, 2), IO_OK);
     other_says(&scene, short_id, 1);
     check_waits(&scene, 0, 100 * MS);
@@ -180,9 +219,9 @@ static void there_is_room_for_a_few_and_freed_room_is_used(void) {
     begin(&scene);
     for (uint8_t id = 0; id < IO_PATIENT_MAX; id++)
         let_wait(&scene, &id, 1, 100 * MS);
-    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, short_id, 1, 100 * MS), IO_FULL);
+    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, short_id, 1, 100 * MS, 0), IO_FULL);
     open_other(&scene, &other);
-    CHECK_EQUAL(io_let_wait(scene.bus, other, short_id, 1, 100 * MS), IO_OK); // each link has its own
+    CHECK_EQUAL(io_let_wait(scene.bus, other, short_id, 1, 100 * MS, 0), IO_OK); // each link has its own
     const uint8_t first = 0, last = IO_PATIENT_MAX - 1;
     let_wait(&scene, &first, 1, 0);
     let_wait(&scene, &last, 1, 300 * MS);
@@ -190,7 +229,7 @@ static void there_is_room_for_a_few_and_freed_room_is_used(void) {
     check_waits(&scene, 0, 300 * MS);
     take(&scene);
     let_wait(&scene, short_id, 1, 200 * MS);
-    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, &first, 1, 100 * MS), IO_FULL);
+    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, &first, 1, 100 * MS, 0), IO_FULL);
     answer(&scene, &last, 1);
     check_waits(&scene, 0, 300 * MS);
     answer(&scene, short_id, 1);
@@ -202,10 +241,10 @@ static void what_is_no_id_or_no_link_is_refused(void) {
     struct scene scene;
     const uint8_t id[IO_ID_MAX + 1] = {0x81, 0x81, 0x81, 0x81, 1, 1};
     begin(&scene);
-    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, id, 0, 1), IO_INVALID);
-    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, id, IO_ID_MAX + 1, 1), IO_INVALID);
-    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, id, IO_ID_MAX, 1), IO_OK);
-    CHECK_EQUAL(io_let_wait(scene.bus, 999, id, 1, 1), IO_GONE);
+    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, id, 0, 1, 0), IO_INVALID);
+    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, id, IO_ID_MAX + 1, 1, 0), IO_INVALID);
+    CHECK_EQUAL(io_let_wait(scene.bus, scene.link, id, IO_ID_MAX, 1, 0), IO_OK);
+    CHECK_EQUAL(io_let_wait(scene.bus, 999, id, 1, 1, 0), IO_GONE);
     CHECK_EQUAL(io_hurry(scene.bus, 999, 1), IO_GONE);
     io_free(scene.bus);
 }
@@ -215,6 +254,8 @@ int main(void) {
     who_takes_it_before_is_not_told();
     what_may_not_wait_is_told_at_once_and_takes_it_along();
     ids_are_compared_whole();
+    all_that_come_together_are_told_at_once();
+    what_was_taken_does_not_count_among_those_that_wait();
     the_least_patience_counts();
     a_patience_may_change_and_end();
     nothing_waits_in_a_hurry();

@@ -156,6 +156,9 @@ def test_a_node_that_is_ready_lets_what_comes_all_the_time_wait() -> None:
     def patience_s(response: str) -> float | None:
         return machine.io.links[-1].patience_s.get(machine.node.dictionary.responses[response].prefix)
 
+    def together() -> int:
+        return machine.io.links[-1].together[machine.node.dictionary.responses[MEASURED].prefix]
+
     async def check() -> None:
         responses = machine.node.dictionary.responses
         assert machine.node.state is NodeState.READY
@@ -168,6 +171,14 @@ def test_a_node_that_is_ready_lets_what_comes_all_the_time_wait() -> None:
                 assert patience_s(name) == (REST_PATIENCE_S if state else PATIENCE_S[name])
         machine.node.let_reports_wait(measurements=False, state=False, clock=False)
         assert patience_s(MEASURED) == PATIENCE_S[MEASURED]
+        assert together() == 0, "nobody knows how many there are"
+        ends = [machine.node.on(MEASURED, oid, lambda _: None) for oid in (1, 2, 3)]
+        machine.node.on(MEASURED, None, lambda _: None)  # of whatever sensor
+        ends[0]()
+        machine.node.let_reports_wait(measurements=True, state=False, clock=False)
+        assert together() == 0, "it waits for others"
+        machine.node.let_reports_wait(measurements=False, state=False, clock=False)
+        assert together() == 2
         machine.node.let_reports_wait(measurements=True, state=True, clock=True)
         machine.io.links[-1].failure = LinkError("can0 node 4: lost")
         machine.node.let_reports_wait(
