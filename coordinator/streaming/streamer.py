@@ -29,8 +29,8 @@ FULL_CYCLE_S: Final = 0.6
 FULL_EARLY_S: Final = 0.1
 """So much earlier it comes when the loop is awake anyway."""
 ALONE_EARLY_S: Final = 0.3
-"""The same after a cycle that woke the loop itself: sensors report that often, and what comes with a report once
-goes on to come with reports."""
+"""The same after a cycle that woke the loop itself: sensors report that often, and what comes with a report
+once goes on to come with reports."""
 BUSY_CYCLE_S: Final = 0.4
 """The same on a busy bus: that it cannot carry the plan has to be found in time."""
 REST_CYCLE_S: Final = 1.0

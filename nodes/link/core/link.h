@@ -97,6 +97,7 @@ struct link_block {
     uint8_t wire_length; // of the last transmission: with the preceding sync bytes
     uint8_t commands;
     uint8_t kind;       // enum link_class of its first command
+    uint8_t answered;   // something in it is no motion, and may have an answer
     uint8_t leads;      // number of req_clocks
     uint64_t due_clock; // the earliest req_clock of its commands of all classes; 0: none has one
     uint64_t req_clock[WIRE_CONTENT_MAX];
@@ -207,6 +208,10 @@ uint64_t link_deadline(const struct link *link, uint64_t now, unsigned allowed);
 
 // Returns since when the oldest transmission has waited for its acknowledgement; UINT64_MAX: none does.
 uint64_t link_unanswered_since(const struct link *link);
+
+// Returns whether the node may owe more than acknowledgements of motion: it is being reached, or a command of
+// another class is not acknowledged.
+int link_awaits_answer(const struct link *link);
 
 // Returns the host time by which to send a motion command of REQ_CLOCK, so that a loss can be repaired before
 // it is due. 0: the clock is unknown.

@@ -185,6 +185,8 @@ void link_take(struct link *link, enum link_class kind, const struct link_front 
             link->motion_content += command.size;
             if (command.req_clock)
                 block->req_clock[block->leads++] = command.req_clock;
+        } else {
+            block->answered = 1;
         }
         link_queue_drop(queue, behind, 1);
     }

@@ -114,6 +114,15 @@ uint64_t io_deadline(const struct io_bus *bus, uint64_t now) {
     return bus->notice_ns < at_ns ? bus->notice_ns : at_ns;
 }
 
+int io_may_stay_unread(const struct io_bus *bus, uint64_t now) {
+    if (bus->ended || bus->admin_count || bus->hold_ns <= now || bus->hold_ns - now > IO_UNREAD_NS)
+        return 0;
+    for (size_t i = 0; i < bus->link_count; i++)
+        if (bus->links[i]->in_a_hurry || link_awaits_answer(&bus->links[i]->link))
+            return 0;
+    return 1;
+}
+
 // ----------------------------------------------------------------------------------------------- for Python
 
 static void set_notice(struct io_bus *bus, uint64_t at_ns) {

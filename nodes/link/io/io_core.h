@@ -26,6 +26,7 @@ enum io_kind {
 enum {
     IO_OUT_FRAMES = 25, // room that io_next() needs, in frames: a block with its longest lead-in (17) and
                         // a further block
+    IO_UNREAD_NS = 2000000,
 };
 
 // Properties of the line; zeros are the defaults.
@@ -67,6 +68,10 @@ int io_bounds_queue(const struct io_bus *bus);
 
 // Returns when io_handle_time() or io_next() next has something to do; UINT64_MAX: not without an event.
 uint64_t io_deadline(const struct io_bus *bus, uint64_t now);
+
+// Returns whether what is received may wait until io_deadline(): more is to be sent once the line has carried
+// what waits in the kernel, within IO_UNREAD_NS, and until then only acknowledgements of motion are expected.
+int io_may_stay_unread(const struct io_bus *bus, uint64_t now);
 
 // The transport ended: an errno, or 0 when its other end closed it.
 void io_end(struct io_bus *bus, int cause);

@@ -33,6 +33,7 @@ struct io_thread {
     uint8_t stopping;
     uint8_t notice_due;      // make notice_fd readable once the lock is free
     uint8_t kernel_full;     // wait until the descriptor is writable
+    uint8_t unread;          // something may have been received that nobody waited for
     uint64_t retry_ns;       // when to try again after ENOBUFS; 0: not now
     uint64_t sleep_until_ns; // what the timer is set to; UINT64_MAX: it is not
     uint8_t out[IO_OUT_FRAMES * FRAME];
@@ -177,9 +178,11 @@ static void set_timer(struct io_thread *thread, uint64_t at_ns) {
 
 // Sleeps until the descriptor, a caller or the timer wakes it; returns the descriptor's events.
 static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
-    struct pollfd fds[3] = {{.fd = io_ended(thread->bus) ? -1 : thread->fd, .events = POLLIN},
-                            {.fd = thread->wake_fd, .events = POLLIN},
-                            {.fd = thread->timer_fd, .events = POLLIN}};
+    thread->unread = io_may_stay_unread(thread->bus, now) && !thread->kernel_full;
+    struct pollfd fds[3] = {
+        {.fd = io_ended(thread->bus) || thread->unread ? -1 : thread->fd, .events = POLLIN},
+        {.fd = thread->wake_fd, .events = POLLIN},
+        {.fd = thread->timer_fd, .events = POLLIN}};
     if (thread->kernel_full)
         fds[0].events |= POLLOUT;
     set_timer(thread, next_deadline(thread, now));
@@ -206,7 +209,7 @@ static void *run(void *argument) {
         if (seen & POLLOUT)
             thread->kernel_full = 0;
         // After sleeping too long, on a busy computer, read what has arrived before timers are evaluated.
-        if ((seen & ~POLLOUT) || overslept(thread, now))
+        if ((seen & ~POLLOUT) || thread->unread || overslept(thread, now))
             now = read_all(thread, now);
         io_handle_time(thread->bus, now);
         write_all(thread, now);
@@ -232,7 +235,7 @@ static void unlock(void *context) {
 }
 
 // The caller sends what it queued itself and sets the thread's timer to a new deadline; the thread sleeps on,
-// and is woken only when it has to poll for something else.
+// and is woken only when it has to poll for something else: what it did not wait for may be an answer now.
 static void kick(void *context) {
     struct io_thread *thread = context;
     int was_full = thread->kernel_full, had_ended = io_ended(thread->bus);
@@ -241,7 +244,8 @@ static void kick(void *context) {
     uint64_t at_ns = next_deadline(thread, now);
     if (at_ns < thread->sleep_until_ns)
         set_timer(thread, at_ns);
-    if (thread->kernel_full != was_full || io_ended(thread->bus) != had_ended)
+    int late = thread->unread && !io_may_stay_unread(thread->bus, now);
+    if (thread->kernel_full != was_full || io_ended(thread->bus) != had_ended || late)
         signal_event(thread->wake_fd);
 }
 

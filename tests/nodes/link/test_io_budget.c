@@ -192,6 +192,102 @@ static void a_full_queue_is_waited_for_only_with_something_to_send(void) {
     io_free(scene.bus);
 }
 
+// -------------------------------------------------------------------------------------------------- reading
+
+static void send_motion(struct scene *scene, int count) {
+    static const uint8_t content[WIRE_CONTENT_MAX] = {4};
+    uint8_t batch[BATCH_HEADER + WIRE_CONTENT_MAX];
+    size_t size = batch_write(batch, 0, 0, content, WIRE_CONTENT_MAX);
+    for (int i = 0; i < count; i++)
+        CHECK_EQUAL(io_send_batch(scene->bus, scene->link, batch, size), IO_OK);
+}
+
+static int may_stay_unread(struct scene *scene) {
+    return io_may_stay_unread(scene->bus, scene->now_ns);
+}
+
+// The kernel's queue is full: until 3 of its 12 frames are left, some 1.1 ms.
+static void acknowledgements_of_motion_wait_until_more_can_be_sent(void) {
+    struct scene scene;
+    uint8_t data = 0;
+    open(&scene, IO_CAN_STREAM, NODE, &full_speed);
+    send_motion(&scene, 1);
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
+    CHECK(!may_stay_unread(&scene)); // the node is being reached
+    pump(&scene, ROOM);
+    CHECK(!may_stay_unread(&scene)); // nothing waits
+    io_free(scene.bus);
+
+    open(&scene, IO_CAN_STREAM, NODE, &full_speed);
+    run_up(&scene);
+    scene.now_ns += 1000 * MS; // the budget holds nothing back
+    CHECK(!may_stay_unread(&scene));
+    send_motion(&scene, 1);
+    pump(&scene, ROOM);
+    send_motion(&scene, 1);
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
+    CHECK(may_stay_unread(&scene));
+    CHECK(io_may_stay_unread(scene.bus, scene.now_ns + 9 * 120000 - 1));
+    CHECK(!io_may_stay_unread(scene.bus, scene.now_ns + 9 * 120000)); // it is to be sent now
+    CHECK_EQUAL(io_hurry(scene.bus, scene.link, 1), IO_OK);
+    CHECK(!may_stay_unread(&scene));
+    CHECK_EQUAL(io_hurry(scene.bus, scene.link, 0), IO_OK);
+    CHECK(may_stay_unread(&scene));
+    CHECK_EQUAL(io_send_frame(scene.bus, TO_PYTHON_ID, &data, 1), IO_OK);
+    CHECK(!may_stay_unread(&scene)); // to which a node may answer
+    CHECK_EQUAL(one_round(&scene, ROOM, 11), FRAME);
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
+    CHECK(may_stay_unread(&scene));
+
+    scene.now_ns += 5 * MS; // all that waited in the kernel is on its way
+    CHECK_EQUAL(pump(&scene, ROOM), FULL_BLOCK_FRAMES);
+    answer(&scene, NULL, 0);
+    scene.now_ns += 5 * MS;
+    send_of(&scene, LINK_CONTROL, 30);
+    CHECK_EQUAL(pump(&scene, ROOM), 5);
+    send_motion(&scene, 1);
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
+    CHECK(!may_stay_unread(&scene)); // an answer is awaited
+    answer(&scene, NULL, 0);
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
+    CHECK(may_stay_unread(&scene));
+    io_end(scene.bus, 0);
+    CHECK(!may_stay_unread(&scene));
+    io_free(scene.bus);
+}
+
+// A command that shares a block with motion is answered, too.
+static void an_answer_to_what_motion_took_along_is_awaited(void) {
+    struct scene scene;
+    uint8_t batch[BATCH_HEADER + 10];
+    size_t size = batch_write(batch, 0, 0, (const uint8_t *)"ten bytes.", 10);
+    open(&scene, IO_CAN_STREAM, NODE, &full_speed);
+    run_up(&scene);
+    scene.now_ns += 1000 * MS;
+    CHECK_EQUAL(io_send_batch(scene.bus, scene.link, batch, size), IO_OK);
+    send_of(&scene, LINK_CONTROL, 1);
+    unsigned blocks = scene.blocks;
+    pump(&scene, ROOM);
+    CHECK_EQUAL(scene.blocks - blocks, 1);
+    send_motion(&scene, 1);
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
+    CHECK(!may_stay_unread(&scene));
+    io_free(scene.bus);
+}
+
+static void a_slow_bus_is_read_meanwhile(void) {
+    struct scene scene;
+    static const struct io_settings settings = {.bitrate = 500000, .queue_frames = 12};
+    open(&scene, IO_CAN_STREAM, NODE, &settings);
+    run_up(&scene);
+    scene.now_ns += 1000 * MS;
+    send_motion(&scene, 1);
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
+    check_deadline(&scene, 9 * 240000);
+    CHECK(!may_stay_unread(&scene));
+    io_free(scene.bus);
+}
+
 // -------------------------------------------------------------------------------------------------- counting
 
 // A frame that is full with one block's end counts for that block's class.
@@ -271,6 +367,9 @@ int main(void) {
     the_budget_holds_bulk_back_until_it_is_paid();
     a_full_queue_and_a_spent_budget_wait_for_the_sooner();
     a_full_queue_is_waited_for_only_with_something_to_send();
+    acknowledgements_of_motion_wait_until_more_can_be_sent();
+    an_answer_to_what_motion_took_along_is_awaited();
+    a_slow_bus_is_read_meanwhile();
     frames_count_for_the_class_of_their_block();
     repeats_share_frames();
     the_cost_of_motion_is_learned_from_motion();

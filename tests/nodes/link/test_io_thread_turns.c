@@ -4,6 +4,7 @@
 #define _GNU_SOURCE
 #include "tests/nodes/link/scripted_kernel.h"
 
+#include "nodes/link/core/batch.h"
 #include "nodes/link/io/io_thread.c" // its calls of the kernel go to the script
 
 #define MS 1000000ULL
@@ -337,6 +338,71 @@ static void a_line_may_end_while_it_is_written(void) {
     stop(thread);
 }
 
+// ----------------------------------------------------------------------------------------- reading meanwhile
+
+// The node acknowledges everything before SEQUENCE.
+static void node_acknowledges(unsigned sequence) {
+    static struct can_frame frame;
+    frame = (struct can_frame){.can_id = 0x100 + 2 * NODE + 1, .can_dlc = WIRE_BLOCK_MIN};
+    wire_block_finish(frame.data, 0, sequence % 16);
+    reading_gives(FRAME, 0, (const uint8_t *)&frame);
+}
+
+static uint32_t running_link(struct io_thread *thread) {
+    uint32_t link;
+    CHECK_EQUAL(io_open_link(thread->bus, NODE, &usual, &link), IO_OK);
+    CHECK_EQUAL(io_send(thread->bus, link, LINK_CONTROL, (const uint8_t *)"\5", 1, 0, 0), IO_OK);
+    for (unsigned sequence = 1; sequence <= 3; sequence++) {
+        kernel.now_ns += MS;
+        node_acknowledges(sequence);
+        kernel_turn(POLLIN);
+    }
+    kernel.now_ns += 1000 * MS;
+    return link;
+}
+
+// Three full blocks, 24 frames, of which 12 go at once and 9 when 3 of these are left.
+static void send_motion(struct io_thread *thread, uint32_t link) {
+    uint8_t batch[BATCH_HEADER + WIRE_CONTENT_MAX];
+    size_t size = batch_write(batch, 0, 0, (const uint8_t[WIRE_CONTENT_MAX]){4}, WIRE_CONTENT_MAX);
+    for (int i = 0; i < 3; i++)
+        CHECK_EQUAL(io_send_batch(thread->bus, link, batch, size), IO_OK);
+    kernel_sleep_out(0);
+    CHECK_EQUAL(kernel.line_fd, -1);
+    CHECK_EQUAL(kernel_timeout_ns(), 9 * 120000);
+    CHECK(!kernel_is_woken());
+}
+
+// Acknowledgements of motion do not wake the thread while it has to wake for the rest anyway; it reads then.
+static void acknowledgements_wait_for_the_rest_of_the_motion(void) {
+    struct io_thread *thread = start(IO_CAN_STREAM, &full_speed);
+    uint32_t link = running_link(thread);
+    send_motion(thread, link);
+    node_acknowledges(4);
+    kernel_sleep_out(0);
+    CHECK_EQUAL(kernel.read_calls, 1);
+    CHECK_EQUAL(kernel.write_calls, 1);
+    CHECK_EQUAL(kernel.line_fd, LINE_FD); // everything is sent
+    struct io_link_stats stats;
+    CHECK_EQUAL(io_get_link_stats(thread->bus, link, &stats), IO_OK);
+    CHECK_EQUAL(stats.in_flight_blocks, 2);
+    kernel_turn(0);
+    CHECK_EQUAL(kernel.read_calls, 0);
+    stop(thread);
+}
+
+static void who_wants_an_answer_has_the_line_read_at_once(void) {
+    struct io_thread *thread = start(IO_CAN_STREAM, &full_speed);
+    uint32_t link = running_link(thread);
+    send_motion(thread, link);
+    CHECK_EQUAL(io_hurry(thread->bus, link, 1), IO_OK);
+    CHECK(kernel_is_woken());
+    kernel_turn(0);
+    CHECK_EQUAL(kernel.read_calls, 1);
+    CHECK_EQUAL(kernel.line_fd, LINE_FD);
+    stop(thread);
+}
+
 // ------------------------------------------------------------------------------------------------------ time
 
 // The node never answers. Its first block is repeated after 100 ms, then after twice as long each time.
@@ -533,6 +599,8 @@ int main(void) {
     a_full_kernel_is_waited_for(IO_CAN_STREAM, 0, ENOBUFS);
     a_kernel_without_buffers_is_asked_again_later();
     a_line_may_end_while_it_is_written();
+    acknowledgements_wait_for_the_rest_of_the_motion();
+    who_wants_an_answer_has_the_line_read_at_once();
     the_thread_sleeps_until_the_next_deadline();
     the_timer_is_set_when_the_deadline_changes();
     a_thread_that_overslept_reads_first();
