@@ -110,12 +110,12 @@ class MessageFormat:
         self.message_id = message_id
         self.names = tuple(names)
         self._known = frozenset(names)
+        self.codes = tuple(CODES[code] for code in codes)
         self._fields = tuple(
             (name, code.wire_type == _BYTES, code.low, code.high, _ALL if code.field == "i" else _BITS32)
-            for name, code in zip(self.names, (CODES[code] for code in codes), strict=True)
+            for name, code in zip(self.names, self.codes, strict=True)
         )
         """Of each parameter the name, whether it is a buffer, the range, and the bits that C gets."""
-        self.codes = tuple(CODES[code] for code in codes)
         self.code_texts = tuple(codes)
         self._count = len(self.names)
         self._types = ffi.new("uint8_t[]", bytes(code.wire_type for code in self.codes) or b"\0")

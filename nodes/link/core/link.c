@@ -136,7 +136,7 @@ static int make_block(struct link *link, uint64_t now, unsigned allowed) {
     }
     struct link_block *block = block_of(link, link->next);
     block->sent_ns = block->due_clock = 0;
-    block->repeats = block->length = block->commands = block->leads = block->answered = 0;
+    block->repeats = block->length = block->commands = block->leads = block->asks = 0;
     block->kind = plan.offer.kind;
     for (size_t i = 0; i < plan.classes; i++)
         link_take(link, plan.order[i], &plan.fronts[plan.order[i]], block);
@@ -292,7 +292,7 @@ uint64_t link_unanswered_since(const struct link *link) {
 int link_awaits_answer(const struct link *link) {
     int awaits = link->state == LINK_PROBING || link->state == LINK_CONFIRMING;
     for (uint64_t i = link->first; i < link->next; i++)
-        awaits |= const_block_of(link, i)->answered;
+        awaits |= const_block_of(link, i)->asks;
     return awaits;
 }
 

@@ -97,7 +97,7 @@ struct link_block {
     uint8_t wire_length; // of the last transmission: with the preceding sync bytes
     uint8_t commands;
     uint8_t kind;       // enum link_class of its first command
-    uint8_t answered;   // something in it is no motion, and may have an answer
+    uint8_t asks;       // something in it is no motion, and may have an answer
     uint8_t leads;      // number of req_clocks
     uint64_t due_clock; // the earliest req_clock of its commands of all classes; 0: none has one
     uint64_t req_clock[WIRE_CONTENT_MAX];

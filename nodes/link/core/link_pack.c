@@ -186,7 +186,7 @@ void link_take(struct link *link, enum link_class kind, const struct link_front 
             if (command.req_clock)
                 block->req_clock[block->leads++] = command.req_clock;
         } else {
-            block->answered = 1;
+            block->asks = 1;
         }
         link_queue_drop(queue, behind, 1);
     }

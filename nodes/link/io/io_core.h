@@ -24,9 +24,9 @@ enum io_kind {
 };
 
 enum {
-    IO_OUT_FRAMES = 25, // room that io_next() needs, in frames: a block with its longest lead-in (17) and
-                        // a further block
-    IO_UNREAD_NS = 2000000,
+    IO_OUT_FRAMES = 25,     // room that io_next() needs, in frames: a block with its longest lead-in (17) and
+                            // a further block
+    IO_UNREAD_NS = 2000000, // how long received data may stay unread
 };
 
 // Properties of the line; zeros are the defaults.
@@ -69,8 +69,9 @@ int io_bounds_queue(const struct io_bus *bus);
 // Returns when io_handle_time() or io_next() next has something to do; UINT64_MAX: not without an event.
 uint64_t io_deadline(const struct io_bus *bus, uint64_t now);
 
-// Returns whether what is received may wait until io_deadline(): more is to be sent once the line has carried
-// what waits in the kernel, within IO_UNREAD_NS, and until then only acknowledgements of motion are expected.
+// Returns whether what is received may stay unread until io_deadline(): there is more to send once the line
+// has carried what waits in the kernel, within IO_UNREAD_NS, and nobody waits for an answer. Reports and
+// triggers come so much later.
 int io_may_stay_unread(const struct io_bus *bus, uint64_t now);
 
 // The transport ended: an errno, or 0 when its other end closed it.
