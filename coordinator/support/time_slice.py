@@ -31,26 +31,26 @@ class _Attributes(ctypes.Structure):
     )
 
 
-def shorten_time_slice(slice_ns: int = SLICE_NS, thread: int = 0) -> None:
-    """Have THREAD (0: this one), and those that it begins from now on, ask for slices of SLICE_NS.
+def shorten_time_slice(slice_ns: int = SLICE_NS) -> None:
+    """Have this thread, and those that it begins from now on, ask for slices of SLICE_NS.
 
     Nothing happens on other computers than those of ``_CALLS``, nor where somebody has chosen another policy
     than the usual one; Linux before 6.12 accepts the request and ignores it.
     """
     set_number, _ = _numbers()
-    attributes = slice_attributes(thread)
+    attributes = slice_attributes()
     if attributes is not None and attributes.policy == os.SCHED_OTHER:
         attributes.runtime_ns = slice_ns
-        ctypes.CDLL(None).syscall(set_number, thread, ctypes.byref(attributes), 0)
+        ctypes.CDLL(None).syscall(set_number, 0, ctypes.byref(attributes), 0)
 
 
-def slice_attributes(thread: int = 0) -> _Attributes | None:
-    """Return what the system says about THREAD (0: this one); None: it does not."""
+def slice_attributes() -> _Attributes | None:
+    """Return what the system says about this thread; None: it does not."""
     _, get_number = _numbers()
     found = _Attributes()
     if not get_number:
         return None
-    failed = ctypes.CDLL(None).syscall(get_number, thread, ctypes.byref(found), ctypes.sizeof(found), 0)
+    failed = ctypes.CDLL(None).syscall(get_number, 0, ctypes.byref(found), ctypes.sizeof(found), 0)
     return None if failed else found
 
 

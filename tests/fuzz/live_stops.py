@@ -9,8 +9,9 @@ next way in, by turns while the control loop is free, while it is held by what w
 what calculates. A plain restart follows, and meanwhile the next machine is stopped: with five machines, there
 is a stop about every second. With --machines 1 the fuzzers are there during restarts, too.
 
+The machine that is stopped has the priority that docs/examples/systemd/canductor.service gives a service.
 Fuzzers and machines that restart stand for other computers: they get the processor time that nobody wants
-(SCHED_IDLE; for machines that needs root, or they compete with the one that is stopped).
+(SCHED_IDLE). Without root all machines compete, and bounds may be missed on a computer with few processors.
 
 Each time is from before the stop's last bytes are sent to the edge of the node's pin. It ends with status 1
 when a stop has no effect, comes later than its bound or does not name who stopped, or when a restart fails.
@@ -42,11 +43,10 @@ from yarl import URL
 
 from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.protocol.methods import ApiError
-from coordinator.support.time_slice import shorten_time_slice
 from coordinator.web.stop_request import STOP_PATH
 from tests.fuzz.ipc_target import line
 from tests.fuzz.live import ROOT
-from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
+from tests.fuzz.proved_service import ADMIN_TOKEN, SERVICE_PRIORITY, WATCH_TOKEN
 from tests.fuzz.standstill import Span, Standstills, stood_still_ms
 from tests.stages.held_service import fan_turns, stopped_after_ms
 
@@ -158,21 +158,20 @@ class Machine:
         number = self._process.pid
         return int(Path(f"/proc/{number}/task/{number}/schedstat").read_text().split()[1]) * 1e-6
 
-    def _schedule(self, policy: int) -> None:
+    def _schedule(self, policy: int, priority: int = 0) -> None:
         """Have the service compete for the processor as POLICY says, as far as the system permits it."""
         if os.geteuid() != 0:  # nobody else gets back from SCHED_IDLE
             return
         for task in Path(f"/proc/{self._process.pid}/task").iterdir():
             with contextlib.suppress(ProcessLookupError):
-                os.sched_setscheduler(int(task.name), policy, os.sched_param(0))
-                shorten_time_slice(thread=int(task.name))  # as before: the call before forgets it
+                os.sched_setscheduler(int(task.name), policy, os.sched_param(priority))
 
     def begin(self) -> None:
         """Have it print with the fan on, unless it does already; lines that were typed are done first."""
         if self._prints:
             return
         self.wait_for(lambda: self.state["state"] == "ready", "it is ready")
-        self._schedule(os.SCHED_OTHER)
+        self._schedule(os.SCHED_RR, SERVICE_PRIORITY)
         for method, params in (("gcode.run", {"script": "M106 S255"}), ("job.start", {"file": "long.gcode"})):
             self.wait_for(lambda: self._is_done(method, params), f"{method} is done")  # noqa: B023 (at once)
         self.wait_for(lambda: fan_turns(self.folder), "the fan turns")

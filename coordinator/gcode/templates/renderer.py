@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.gcode.templates.messages import BadAnswer, encode_request, read_answer
+from coordinator.support.realtime import end_realtime
 
 CPU_S: Final = 0.3
 """Processor time that rendering a template may take."""
@@ -86,6 +87,7 @@ class _Process:
                 env={**os.environ, "PYTHONPATH": str(_ROOT), "PYTHONHASHSEED": "0"},
                 start_new_session=True,  # Ctrl-C is for the program
             )
+            end_realtime(self._process.pid)
         except OSError:
             self._channel.close()
             raise

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from coordinator.ipc.discovery.announcement import Announcement
+from coordinator.support.realtime import end_realtime
 
 RESTART_S: Final = 60.0
 """Before a process that ended by itself is started again."""
@@ -22,7 +23,7 @@ _ROOT: Final = Path(__file__).parents[3]
 
 async def launch_process(bound: list[str]) -> asyncio.subprocess.Process:
     """Start the process for a machine whose sockets are BOUND to these addresses; raises OSError."""
-    return await asyncio.create_subprocess_exec(
+    process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-P",
         "-m",
@@ -33,6 +34,8 @@ async def launch_process(bound: list[str]) -> asyncio.subprocess.Process:
         limit=LINE_MAX,
         env=os.environ | {"PYTHONPATH": str(_ROOT)},
     )
+    end_realtime(process.pid)
+    return process
 
 
 class AnnouncerProcess:
