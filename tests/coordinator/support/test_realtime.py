@@ -10,7 +10,8 @@ TEMPLATES = """
 import os
 from coordinator.gcode.templates.renderer import TemplateRenderer
 from tests.coordinator.gcode.templates.workers import children
-TemplateRenderer().render("{ 1 }", {}, {})
+renderer = TemplateRenderer()  # kept: its process ends with it
+renderer.render("{ 1 }", {}, {})
 print(os.sched_getscheduler(0), *map(os.sched_getscheduler, children()))
 """
 ANNOUNCEMENT = """
