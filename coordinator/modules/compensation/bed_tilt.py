@@ -17,7 +17,7 @@ from coordinator.modules.levelling.surfaces import Plane, fit_plane
 from coordinator.modules.probes.probe import Measured, Probe
 from coordinator.motion.specs import MotionLimits
 from coordinator.motion.steps.errors import StepError
-from coordinator.motion.steps.surface import Surface, surface_nodes
+from coordinator.motion.steps.surface import Surface
 from coordinator.runtime.module_context import ModuleContext
 
 STEEPEST: Final = 0.1
@@ -79,7 +79,7 @@ class Tilt:
         nodes = [
             [(self.height(x, y), self.x, self.y, 0.0) for x in (low[0], high[0])] for y in (low[1], high[1])
         ]
-        return Surface((low[0], low[1]), (high[0] - low[0], high[1] - low[1]), surface_nodes(nodes))
+        return Surface((low[0], low[1]), (high[0] - low[0], high[1] - low[1]), nodes)
 
 
 class BedTilt(Module):

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Final
 
 from coordinator.kinematics.geometry import fit_point
-from coordinator.motion.steps.surface import NO_FADE, Surface, surface_nodes
+from coordinator.motion.steps.surface import NO_FADE, Surface
 
 Place = tuple[float, float]
 """X and Y, mm."""
@@ -120,7 +120,7 @@ class Mesh:
             for row, (value_y, slope_y) in enumerate(along_y)
         ]
         origin = (self.minimum[0] - offset[0], self.minimum[1] - offset[1])
-        return Surface(origin, (width / parts, depth / parts), surface_nodes(nodes), fade)
+        return Surface(origin, (width / parts, depth / parts), nodes, fade)
 
     def fine_heights(self) -> Heights:
         """Return the heights of the surface with ``pps`` more points between two measured ones."""

@@ -1,7 +1,6 @@
 """The shape of a bed, as step generation follows it (the manual is step_surface.h)."""
 
 import math
-from array import array
 from collections.abc import Sequence
 from itertools import chain
 from typing import Any, Final
@@ -17,28 +16,32 @@ NO_FADE: Final = (math.inf, math.inf, 0.0)
 class Surface:
     """A bicubic surface over X and Y, added to Z; never changed.
 
-    NODES (``surface_nodes``): rows of X, 2 to 256 nodes both ways, of four doubles each: height (mm), its
-    slopes by X and by Y, its twist (by both, 1/mm). FADE_MM: the planned Z up to which all of it acts, the
-    one from which only the third value is added, and that (infinite: all acts at any height). Raises
-    StepError when it can be no bed's.
+    NODES: rows of X, 2 to 256 nodes both ways, of four numbers each: height (mm), its slopes by X and by Y,
+    its twist (by both, 1/mm). FADE_MM: the planned Z up to which all of it acts, the one from which only the
+    third value is added, and that (infinite: all acts at any height). Raises StepError when it can be no
+    bed's.
     """
 
     def __init__(
         self,
         origin_mm: tuple[float, float],
         spacing_mm: tuple[float, float],
-        nodes: "memoryview[float]",
+        nodes: Sequence[Sequence[Sequence[float]]],
         fade_mm: tuple[float, float, float] = NO_FADE,
     ) -> None:
         self.origin_mm = origin_mm
         """X and Y of the first node."""
         self.spacing_mm = spacing_mm
         """Of nodes along X and along Y."""
-        self.nodes = nodes
         self.fade_mm = fade_mm
-        self._memory = ffi.from_buffer("double[]", nodes)
+        rows, columns = len(nodes), len(nodes[0])
+        # A copy: no view of the caller's memory may outlive this call (tests/test_borrowed_memory.py).
+        self._memory: Any = ffi.new("double[]", [*chain.from_iterable(chain.from_iterable(nodes))])
+        self.nodes: memoryview[float] = memoryview(ffi.buffer(self._memory)).cast(
+            "d", (rows, columns, _NODE_VALUES)
+        )
+        """The nodes; rows of X, of four numbers each."""
         grid: Any = ffi.new("struct step_surface *")
-        rows, columns, _ = nodes.shape or (0, 0, 0)
         grid.points_y, grid.points_x = rows, columns
         grid.from_x, grid.from_y = origin_mm
         grid.step_x, grid.step_y = spacing_mm
@@ -68,9 +71,3 @@ class Surface:
     def planned_z(self, x: float, y: float, motor_z: float) -> float:
         """Return the planned Z of a place to which the motors went, mm."""
         return float(lib.step_surface_planned_z(self.grid, x, y, motor_z))
-
-
-def surface_nodes(rows: Sequence[Sequence[Sequence[float]]]) -> "memoryview[float]":
-    """Return ROWS of nodes as ``Surface`` takes them."""
-    values = array("d", chain.from_iterable(chain.from_iterable(rows)))
-    return memoryview(values).cast("B").cast("d", (len(rows), len(rows[0]), _NODE_VALUES))

@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps.steps import MAX_ERROR_S, StepGenerator
-from coordinator.motion.steps.surface import NO_FADE, Surface, surface_nodes
+from coordinator.motion.steps.surface import NO_FADE, Surface
 from coordinator.verification.exact_bed import ExactBed
 from coordinator.verification.exact_path import Leg, Setting
 from tests.coordinator.motion.exact_cases import AWAY, PARAMS, chain, spec_of, trapezoids
@@ -27,9 +27,7 @@ def bed(seed: int, fade: tuple[float, float, float] = NO_FADE, *, spacing_mm: fl
     rng = np.random.default_rng(seed)
     sizes = (0.015 * spacing_mm, 0.01, 0.01, 0.007 / spacing_mm)
     nodes = np.stack([rng.normal(0, size, (4, 5)) for size in sizes], axis=-1)
-    return Surface(
-        (AWAY[0] - 14, AWAY[1] - 9), (spacing_mm, spacing_mm * 0.8), surface_nodes(nodes.tolist()), fade
-    )
+    return Surface((AWAY[0] - 14, AWAY[1] - 9), (spacing_mm, spacing_mm * 0.8), nodes.tolist(), fade)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +56,7 @@ class SomeBed:
             if self.fades
             else NO_FADE
         )
-        return Surface(corner, (step, step), surface_nodes(nodes.tolist()), fade)
+        return Surface(corner, (step, step), nodes.tolist(), fade)
 
 
 def over_bed(seed: int, *, lift: bool = False, count: int = MOVES) -> Any:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from coordinator.motion.steps.errors import StepError
 from coordinator.motion.steps.shapers import shaper_impulses
 from coordinator.motion.steps.steps import StepGenerator
-from coordinator.motion.steps.surface import Surface, surface_nodes
+from coordinator.motion.steps.surface import Surface
 from coordinator.verification.exact_bed import ExactBed
 from coordinator.verification.exact_path import Setting
 from tests.coordinator.motion.bed_cases import WITH_Z, SomeBed, across, bed, judge, over_bed, z_spec
@@ -56,7 +56,7 @@ def test_every_step_over_any_bed(some: SomeBed, kind: str, shaper: str | None, *
 def test_long_moves_over_many_patches(seed: int) -> None:
     spec = replace(spec_of("z"), step_distance=0.0005)
     surface = bed(seed, spacing_mm=7.0)
-    nodes = surface_nodes(np.tile(np.asarray(surface.nodes) / 3, (3, 3, 1)).tolist())
+    nodes = np.tile(np.asarray(surface.nodes) / 3, (3, 3, 1)).tolist()
     fine = Surface(surface.origin_mm, (7.0 / 3, 5.6 / 3), nodes)
     assert judge(spec, across(seed), Setting(), fine) > 5000
 
@@ -73,7 +73,7 @@ def test_moves_from_the_edge() -> None:
         for begin, end in ((AWAY, far), (far, beyond)):
             moves.append(make_move(t, begin, end, (0.0, 150.0, 0.0), 8000.0))
             t += moves[-1].total_s + rng.choice([0.0, 0.3])
-    surface = Surface(AWAY[:2], (20.0, 20.0), surface_nodes(nodes.tolist()))
+    surface = Surface(AWAY[:2], (20.0, 20.0), nodes.tolist())
     assert judge(spec, trapezoids(moves), Setting(), surface) > 500
 
 
@@ -105,16 +105,17 @@ def test_taking_up_and_clearing_a_surface_moves_nothing() -> None:
     [
         ("spacing_mm", (0.01, 5.0)),
         ("origin_mm", (math.nan, 0.0)),
-        ("nodes", surface_nodes(np.zeros((1, 5, 4)).tolist())),
-        ("nodes", surface_nodes(np.full((3, 3, 4), math.inf).tolist())),
-        ("nodes", surface_nodes(np.random.default_rng(1).normal(0, 10, (3, 3, 4)).tolist())),  # a cliff
+        ("nodes", np.zeros((1, 5, 4)).tolist()),
+        ("nodes", np.full((3, 3, 4), math.inf).tolist()),
+        ("nodes", np.random.default_rng(1).normal(0, 10, (3, 3, 4)).tolist()),  # a cliff
         ("fade_mm", (5.0, 2.0, 0.0)),
         ("fade_mm", (5.0, 5.01, 0.0)),  # faster than the bed is deep
     ],
 )
 def test_what_is_no_bed_is_refused(change: str, value: Any) -> None:
     good = bed(1)
-    values = {name: getattr(good, name) for name in ("origin_mm", "spacing_mm", "nodes", "fade_mm")}
+    values = {name: getattr(good, name) for name in ("origin_mm", "spacing_mm", "fade_mm")}
+    values["nodes"] = good.nodes.tolist()
     with pytest.raises(StepError, match="shape of the bed is refused"):
         Surface(**(values | {change: value}))
 
