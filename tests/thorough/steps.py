@@ -57,6 +57,12 @@ def steps(amount: Amount) -> Iterator[Step]:
         _PYTEST_FIGURE,
     )
     yield Step(
+        "memory",
+        "all tests, with memory that is filled when taken and freed, and garbage collected late",
+        ("env", "MALLOC_PERTURB_=165", "PYTHONMALLOC=debug", *pytest, "-p", "tests.late_collection"),
+        _PYTEST_FIGURE,
+    )
+    yield Step(
         "sim",
         "machines in virtual time, each seed with other faults",
         (python, "-m", "coordinator.cli.main", "simulate", "--seeds", f"0:{amount.seeds}"),

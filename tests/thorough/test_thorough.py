@@ -18,6 +18,7 @@ def test_the_steps_are_those_of_the_manual() -> None:
     assert names == [
         "full",
         "ties",
+        "memory",
         "sim",
         "loss-5",
         "loss-10",

@@ -150,9 +150,9 @@ def test_limits_that_slicers_write_hold_up_to_the_configured_ones_until_the_next
     assert core.limits.max_extrude_only_velocity == min(30, LIMITS.max_extrude_only_velocity)
     assert core.limits.square_corner_velocity == min(2, LIMITS.square_corner_velocity)
     planner.reset_modes()
-    fresh = Planner(LIMITS)._core.limits
+    fresh = Planner(LIMITS)._core
     for name in ("x_accel", "x_velocity", "z_accel", "z_velocity", "extrude_only_velocity"):
-        assert getattr(core.limits, f"max_{name}") == getattr(fresh, f"max_{name}")
+        assert getattr(core.limits, f"max_{name}") == getattr(fresh.limits, f"max_{name}")
 
 
 @pytest.mark.parametrize("line", ["M201 X0", "M203 Z-1", "M205 X0"])

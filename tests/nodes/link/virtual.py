@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from nodes.link._link import ffi, lib
+from tests.nodes.link.plain import plain
 from tests.nodes.link.twin import NodeTwin, WindowObserver
 
 MS = 1_000_000
@@ -98,7 +99,7 @@ class CoreLink:
     def stats(self) -> Any:
         out = ffi.new("struct link_stats *")
         lib.link_get_stats(self.c, out)
-        return out
+        return plain(out)
 
     @property
     def lost(self) -> bool:

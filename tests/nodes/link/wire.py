@@ -13,6 +13,7 @@ from typing import Any
 from nodes.link._link import ffi, lib
 from nodes.virtual._hub import lib as hub
 from tests.nodes.link.peers import FRAME, pack_frame
+from tests.nodes.link.plain import plain
 from tests.nodes.link.twin import NodeTwin
 from tests.wire_twin import block
 
@@ -88,17 +89,17 @@ class Wire:
     def forecast(self) -> Any:
         out: Any = ffi.new("struct io_forecast *")
         lib.io_forecast(self.c, out)
-        return out
+        return plain(out)
 
     def stats(self) -> Any:
         out: Any = ffi.new("struct io_stats *")
         lib.io_get_stats(self.c, out)
-        return out
+        return plain(out)
 
     def link_stats(self, node: Node) -> Any:
         out: Any = ffi.new("struct io_link_stats *")
         assert lib.io_get_link_stats(self.c, node.number, out) == lib.IO_OK
-        return out
+        return plain(out)
 
     # ----------------------------------------------------------------------------------------- the wire
 
