@@ -67,7 +67,8 @@ pytest-coordinator: WHAT = tests/coordinator $(addprefix --ignore=,$(LIVE) $(MOT
 pytest-motion: WHAT = $(MOTION)
 # The import floors are part of check.
 pytest-others: WHAT = tests $(addprefix --ignore=,$(LIVE) tests/sim tests/coordinator tests/test_import_floors.py)
-PARTS := pytest-live pytest-sim-a-m pytest-sim-n-z pytest-coordinator pytest-others pytest-motion
+# Those that wait for processes come first, beside each other; what only calculates fills the processors to the end.
+PARTS := pytest-live pytest-others pytest-coordinator pytest-sim-n-z pytest-sim-a-m pytest-motion
 $(PARTS): $(VENV)/.installed
 	$(BIN)/pytest $(WHAT)
 
@@ -76,7 +77,7 @@ pytest:
 
 # All of it in parallel. Nothing but a dozen smoke tests takes real time (docs/testing.md).
 test:
-	@$(MAKE) -k -j3 --output-sync=target check $(PARTS) ctest
+	@$(MAKE) -k -j3 --output-sync=target $(PARTS) check ctest
 
 # Ten minutes of hostile G-code through the motion engine, under the sanitizers; ctest has a short run of it.
 FUZZ_SECONDS ?= 600

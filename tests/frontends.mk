@@ -1,5 +1,5 @@
 # Real front ends, from PyPI in an environment of their own, on virtual hardware (docs/klippy-api.md).
-.PHONY: frontends octoprint
+.PHONY: frontends frontends-api frontends-pages octoprint moonraker
 
 MOONRAKER := moonraker==0.11.0
 # A name with = would be a variable where make is called with it.
@@ -10,15 +10,24 @@ $(MOONRAKER_STAMP):
 	build/frontends/bin/pip install --quiet --disable-pip-version-check $(MOONRAKER)
 	touch $@
 
-# Builds of Mainsail and Fluidd (tests/frontends/browser.py names them); without them, or without Chromium, the
-# second line says that it skips them.
+moonraker: setup
+	@$(MAKE) --no-print-directory $(MOONRAKER_STAMP) || echo "pip could not install $(MOONRAKER)"
+
+# Builds of Mainsail and Fluidd (tests/frontends/browser.py names them); without them, or without Chromium,
+# frontends-pages says that it skips them.
 FRONT_ENDS ?= ../shared/frontends
 
-frontends: setup
-	@if $(MAKE) --no-print-directory $(MOONRAKER_STAMP); then \
-	  $(BIN)/python -m tests.frontends.moonraker build/frontends/bin/moonraker && \
+frontends: frontends-api frontends-pages
+
+frontends-api: moonraker
+	@if [ -e $(MOONRAKER_STAMP) ]; then \
+	  $(BIN)/python -m tests.frontends.moonraker build/frontends/bin/moonraker; \
+	else echo "skipped: Moonraker"; fi
+
+frontends-pages: moonraker
+	@if [ -e $(MOONRAKER_STAMP) ]; then \
 	  $(BIN)/python -m tests.frontends build/frontends/bin/moonraker $(FRONT_ENDS); \
-	else echo "skipped: Moonraker and the front ends; pip could not install $(MOONRAKER)"; fi
+	else echo "skipped: Mainsail and Fluidd"; fi
 
 OCTOPRINT := octoprint==1.11.8
 

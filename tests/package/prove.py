@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -44,6 +45,8 @@ PIP: Final = ("pip", "-q", "--disable-pip-version-check")
 PAGES: Final = "import coordinator.web.files as f; assert (f.FOLDER / 'index.html').is_file()"
 VERSION: Final = "import sys; print('%d.%d' % sys.version_info[:2])"
 LOCATION: Final = "import coordinator; print(coordinator.__file__)"
+AT_ONCE: Final = 3
+"""Installations that are proved at the same time: each waits for an index, then prints in real time."""
 
 
 class ProofError(Exception):
@@ -99,6 +102,20 @@ def missing(python: str) -> str:
     return subprocess.run(words, capture_output=True, text=True, check=False).stderr.strip()
 
 
+def usable(named: list[str]) -> list[tuple[str, str]]:
+    """Return the ``interpreters`` that can build the project; says what the others lack."""
+    found = []
+    for version, python in interpreters(named):
+        lacking = python != sys.executable and not named and missing(python)
+        if lacking:
+            print(f"python {version}: skipped: {lacking}", flush=True)
+        else:
+            found.append((version, python))
+    if not found:
+        raise ProofError("none of these is a Python from 3.11 on; name one that is")
+    return found
+
+
 def environment(python: str, folder: Path) -> Path:
     """Return the folder of the commands of a new virtual environment for PYTHON, in FOLDER."""
     folder.mkdir()
@@ -145,17 +162,18 @@ def main() -> int:
         try:
             setup(folder, "sdist", "--formats=gztar", f"--dist-dir={folder}")
             (archive,) = folder.glob("*.tar.gz")
-            wheel = None
-            for version, python in interpreters(options.pythons):
-                lacking = python != sys.executable and not options.pythons and missing(python)
-                if lacking:
-                    print(f"python {version}: skipped: {lacking}", flush=True)
-                    continue
-                if wheel is None:
-                    wheel, built_s = build(archive, python, folder / "build")
-                    print(f"python {version}: {wheel.name} built in {built_s:.0f} s", flush=True)
-                print(f"python {version}: {prove(wheel, python, folder / version)}", flush=True)
-        except (ProofError, subprocess.SubprocessError) as error:
+            pythons = usable(options.pythons)
+            version, python = pythons[0]
+            wheel, built_s = build(archive, python, folder / "build")
+            print(f"python {version}: {wheel.name} built in {built_s:.0f} s", flush=True)
+            with ThreadPoolExecutor(AT_ONCE) as pool:
+                proofs = {
+                    version: pool.submit(prove, wheel, python, folder / version)
+                    for version, python in pythons
+                }
+                for version, proof in proofs.items():
+                    print(f"python {version}: {proof.result()}", flush=True)
+        except (ProofError, OSError, subprocess.SubprocessError) as error:
             print(f"package: {error}", file=sys.stderr)
             return 1
         if options.keep:
