@@ -11,7 +11,7 @@ $(MOONRAKER_STAMP):
 	touch $@
 
 moonraker: setup
-	@$(MAKE) --no-print-directory $(MOONRAKER_STAMP) || echo "pip could not install $(MOONRAKER)"
+	@$(MAKE) --no-print-directory $(MOONRAKER_STAMP) || true # those who need it say so
 
 # Builds of Mainsail and Fluidd (tests/frontends/browser.py names them); without them, or without Chromium,
 # frontends-pages says that it skips them.
@@ -22,12 +22,12 @@ frontends: frontends-api frontends-pages
 frontends-api: moonraker
 	@if [ -e $(MOONRAKER_STAMP) ]; then \
 	  $(BIN)/python -m tests.frontends.moonraker build/frontends/bin/moonraker; \
-	else echo "skipped: Moonraker"; fi
+	else echo "skipped: Moonraker; pip could not install $(MOONRAKER)"; fi
 
 frontends-pages: moonraker
 	@if [ -e $(MOONRAKER_STAMP) ]; then \
 	  $(BIN)/python -m tests.frontends build/frontends/bin/moonraker $(FRONT_ENDS); \
-	else echo "skipped: Mainsail and Fluidd"; fi
+	else echo "skipped: Mainsail and Fluidd; pip could not install $(MOONRAKER)"; fi
 
 OCTOPRINT := octoprint==1.11.8
 

@@ -1,7 +1,7 @@
 """C uses memory of Python objects within a function only; no object keeps such a view (``ffi.from_buffer``).
 
 Python's garbage collector takes a cycle apart in any order. A memoryview that it empties while C's view of it
-is still there ends the process with a segmentation fault, in 3.11 and later.
+is still there ends the process with a segmentation fault (seen with 3.11).
 """
 
 import ast
@@ -11,17 +11,6 @@ ROOT = Path(__file__).parent.parent
 FOLDERS = ("coordinator", "nodes", "canbus_tools")
 
 
-def borrows(tree: ast.AST) -> bool:
-    """Return whether any part of TREE is a call of ``from_buffer``."""
-    return any(
-        isinstance(part, ast.Call)
-        and isinstance(part.func, ast.Attribute | ast.Name)
-        and (part.func.attr if isinstance(part.func, ast.Attribute) else part.func.id).lstrip("_")
-        == "from_buffer"
-        for part in ast.walk(tree)
-    )
-
-
 def kept(source: str) -> list[int]:
     """Return the lines of SOURCE that store such a view in an attribute."""
     found = []
@@ -29,7 +18,7 @@ def kept(source: str) -> list[int]:
         if isinstance(part, ast.Assign | ast.AnnAssign):
             targets = part.targets if isinstance(part, ast.Assign) else [part.target]
             stored = any(isinstance(at, ast.Attribute) for to in targets for at in ast.walk(to))
-            if stored and part.value is not None and borrows(part.value):
+            if stored and part.value is not None and "from_buffer(" in ast.unparse(part.value):
                 found.append(part.lineno)
     return found
 
