@@ -2,11 +2,15 @@
 
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from tests.fuzz.live_stops import BOUNDS_MS, WAYS, Found, Stop, late, table, verdict
+from tests.fuzz.proved_service import SERVICE_PRIORITY
 from tests.fuzz.standstill import stood_still_ms
+
+UNIT = Path(__file__).parents[2] / "docs" / "examples" / "systemd" / "canductor.service"
 
 
 def sound() -> Found:
@@ -68,3 +72,8 @@ def test_the_table_has_the_worst_of_each_state() -> None:
     rows = list(table(stops, [3.0, 12.0, 20.0]))
     assert rows[1] == "loop free: n 2, worst 12.00 ms; bound 10 ms"
     assert rows[3] == "loop held: n 1, worst 20.00 ms; bound 50 ms"
+
+
+def test_a_machine_is_stopped_with_the_priority_of_a_service() -> None:
+    lines = UNIT.read_text(encoding="utf-8").splitlines()
+    assert {"CPUSchedulingPolicy=rr", f"CPUSchedulingPriority={SERVICE_PRIORITY}"} <= set(lines)
