@@ -10,8 +10,9 @@ what calculates. A plain restart follows, and meanwhile the next machine is stop
 is a stop about every second. With --machines 1 the fuzzers are there during restarts, too.
 
 The machine that is stopped has the priority that docs/examples/systemd/canductor.service gives a service.
-Fuzzers and machines that restart stand for other computers: they get the processor time that nobody wants
-(SCHED_IDLE). Without root all machines compete, and bounds may be missed on a computer with few processors.
+All others stand for other computers. Its nodes, and whoever stops it, do not wait for a processor while it
+has them: their priority is higher. Fuzzers and machines that restart get the processor time that nobody wants
+(SCHED_IDLE). Without root all compete, and bounds may be missed on a computer with few processors.
 
 Each time is from before the stop's last bytes are sent to the edge of the node's pin. It ends with status 1
 when a stop has no effect, comes later than its bound or does not name who stopped, or when a restart fails.
@@ -54,6 +55,8 @@ BOUNDS_MS: Final = {"free": 10.0, "held": 50.0, "calculating": 50.0}
 """Of the time to the node's pin, by the state of the loop."""
 OWN_ADDRESS: Final = "127.0.0.9"
 """From here stops come over TCP: wrong tokens lock the fuzzers' addresses out."""
+OTHERS_PRIORITY: Final = SERVICE_PRIORITY + 1
+"""Of nodes and of who stops a machine."""
 LEAST_PRIORITY: Final = ("chrt", "--idle", "0")
 PATIENCE_S: Final = 60.0
 LOOK_S: Final = 0.005
@@ -86,6 +89,23 @@ class Found:
     """When a processor of the computer did."""
 
 
+def schedule(task: int, policy: int, priority: int = 0) -> None:
+    """Have TASK (a thread; 0: this one) compete for the processor as POLICY says, if it is permitted."""
+    if os.geteuid() == 0:  # nobody else gets back from SCHED_IDLE
+        with contextlib.suppress(ProcessLookupError):
+            os.sched_setscheduler(task, policy, os.sched_param(priority))
+
+
+@contextlib.contextmanager
+def on_another_computer() -> Iterator[None]:
+    """Wait for no processor that a machine has, inside."""
+    schedule(0, os.SCHED_RR, OTHERS_PRIORITY)
+    try:
+        yield
+    finally:
+        schedule(0, os.SCHED_OTHER)
+
+
 class Machine:
     """The machine in FOLDER, and its operator; a context manager."""
 
@@ -109,6 +129,7 @@ class Machine:
         self._stack.callback(self._process.communicate)
         os.close(theirs)
         self.ways = json.loads(self._answer())
+        self._schedule_nodes()
         self.operator = self._stack.enter_context(BlockingClient(str(self.folder / "api.sock")))
         self.browser = self._stack.enter_context(Browser(self.ways["pages"]))
         return self
@@ -160,11 +181,18 @@ class Machine:
 
     def _schedule(self, policy: int, priority: int = 0) -> None:
         """Have the service compete for the processor as POLICY says, as far as the system permits it."""
-        if os.geteuid() != 0:  # nobody else gets back from SCHED_IDLE
-            return
-        for task in Path(f"/proc/{self._process.pid}/task").iterdir():
-            with contextlib.suppress(ProcessLookupError):
-                os.sched_setscheduler(int(task.name), policy, os.sched_param(priority))
+        for task in self._tasks():
+            schedule(int(task.name), policy, priority)
+
+    def _tasks(self) -> list[Path]:
+        return list(Path(f"/proc/{self._process.pid}/task").iterdir())
+
+    def _schedule_nodes(self) -> None:
+        """Have no node wait for a processor that a service has: they are all children that it has yet."""
+        for task in self._tasks():
+            with contextlib.suppress(FileNotFoundError):
+                for node in (task / "children").read_text(encoding="ascii").split():
+                    schedule(int(node), os.SCHED_RR, OTHERS_PRIORITY)
 
     def begin(self) -> None:
         """Have it print with the fan on, unless it does already; lines that were typed are done first."""
@@ -457,8 +485,9 @@ def stop(machine: Machine, way: str, state: str, number: str, found: Found) -> N
     who, stopping = WAYS[way]
     waited_ms = machine.waited_ms
     with stopping(machine, who.format(number)) as send, machine.loop(state):
-        sent_ns = time.monotonic_ns()
-        send()
+        with on_another_computer():
+            sent_ns = time.monotonic_ns()
+            send()
         machine.wait_for(lambda: not fan_turns(machine.folder), f"the node is stopped by {way}")
     found.stops.append(Stop(way, state, sent_ns, machine.folder, machine.waited_ms - waited_ms))
     machine.wait_for(lambda: machine.state["state"] == "shutdown", "it is shut down")
