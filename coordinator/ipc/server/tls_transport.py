@@ -215,7 +215,9 @@ class TlsTransport(EncryptedTransport):
 
     def carried_by(self, raw: asyncio.Transport) -> None:
         """Begin: RAW sends what is encrypted; what comes is read here."""
-        raw.pause_reading()
+        # Not at once: asyncio of 3.11.2 (Debian 12) begins to read after connection_made, whatever was paused
+        # in there. The pause is ahead of what it might read until then.
+        self._loop.call_soon(raw.pause_reading)
         self._raw = raw
         self._state.carried_by(raw, self._handle_news)
         self._loop.add_reader(self._state.socket, self._readable)

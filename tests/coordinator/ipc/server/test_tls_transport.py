@@ -4,9 +4,11 @@ import asyncio
 import random
 import socket
 import ssl
+from asyncio.selector_events import _SelectorTransport  # type: ignore[attr-defined]
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -109,6 +111,25 @@ def test_bytes_go_both_ways(certificate: tuple[Path, Path]) -> None:
         guest.transport.write(sent)
         assert await reader.readexactly(len(sent)) == sent
 
+    run(certificate, body)
+
+
+def test_an_old_asyncio_takes_no_bytes(
+    certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That of Python 3.11.2 reads what was paused in connection_made; it took the handshake before."""
+    sent = some(MIB)
+
+    def add_reader(self: Any, fd: int, callback: Callable[[], None]) -> None:
+        if not self.is_closing():
+            self._loop._add_reader(fd, callback)
+
+    async def body(guest: Guest, _: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(sent)
+        await guest.has(len(sent))
+        assert guest.got == sent
+
+    monkeypatch.setattr(_SelectorTransport, "_add_reader", add_reader)
     run(certificate, body)
 
 
