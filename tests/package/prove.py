@@ -2,11 +2,12 @@
 
 Usage: python -m tests.package.prove [--keep FOLDER] [PYTHON...]
 
-PYTHONs are this one and one of every other version found on the PATH or below pyenv, unless some are named;
-what could not build it is named and skipped. The first one's pip builds the wheel from the source
-distribution, for all of them, since it is one of the stable ABI. For each, a new virtual environment in a
-temporary folder gets that wheel, with its dependencies from pip's index. There the demo prints a small
-program and has to end with its proof. Exit status 1 when anything fails; the last words say what.
+PYTHONs are this one and one of every other release found on the PATH or below pyenv, unless some are named;
+what could not build it is named and skipped. Debian's own is among them, which has not the last fixes of its
+version. The first one's pip builds the wheel from the source distribution, for all of them, since it is
+one of the stable ABI. For each, a new virtual environment in a temporary folder gets that wheel, with its
+dependencies from pip's index. There the demo prints a small program and has to end with its proof, and a
+machine that is served over TLS has to answer. Exit status 1 when anything fails; the last words say what.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -23,7 +25,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
+from tests.coordinator.certificates import make_certificate
 from tests.package.build import ROOT, setup
+from tests.stages.processes import own_port
 
 NAMES: Final = tuple(f"python3.{minor}" for minor in range(11, 20))
 PROGRAM: Final = """\
@@ -43,9 +47,10 @@ G1 Z0.6 F600
 DEMO: Final = ("--machine", "demo", "--json", "--gcode", "square.gcode")
 PIP: Final = ("pip", "-q", "--disable-pip-version-check")
 PAGES: Final = "import coordinator.web.files as f; assert (f.FOLDER / 'index.html').is_file()"
-VERSION: Final = "import sys; print('%d.%d' % sys.version_info[:2])"
+VERSION: Final = "import sys; print('%d.%d.%d' % sys.version_info[:3])"
 LOCATION: Final = "import coordinator; print(coordinator.__file__)"
-AT_ONCE: Final = 3
+TOKEN: Final = "t" * 32
+AT_ONCE: Final = 4
 """Installations that are proved at the same time: each waits for an index, then prints in real time."""
 
 
@@ -53,15 +58,25 @@ class ProofError(Exception):
     """What is shipped does not work; the text says what was run and how it ended."""
 
 
-def run(folder: Path, *words: str | Path, seconds: float = 600.0) -> str:
-    """Return what the command WORDS prints, run in FOLDER without anything of this environment's Python."""
-    kept = {
+def begin(folder: Path, *words: str | Path) -> subprocess.Popen[str]:
+    """Begin the command WORDS in FOLDER, without anything of this environment's Python."""
+    return subprocess.Popen(
+        words, cwd=folder, env=_environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def _environment() -> dict[str, str]:
+    return {
         name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
     }
+
+
+def run(folder: Path, *words: str | Path, seconds: float = 600.0) -> str:
+    """Return what the command WORDS prints, run in FOLDER without anything of this environment's Python."""
     ended = subprocess.run(
         [str(word) for word in words],
         cwd=folder,
-        env=kept,
+        env=_environment(),
         capture_output=True,
         text=True,
         timeout=seconds,
@@ -74,7 +89,7 @@ def run(folder: Path, *words: str | Path, seconds: float = 600.0) -> str:
 
 
 def interpreters(named: list[str]) -> Iterator[tuple[str, str]]:
-    """Yield the version and path of each Python: those NAMED, else one of each version from 3.11 on."""
+    """Yield the version and path of each Python: those NAMED, else one of each release from 3.11 on."""
     found = named or [sys.executable, *_installed()]
     seen: set[str] = set()
     for python in found:
@@ -83,15 +98,16 @@ def interpreters(named: list[str]) -> Iterator[tuple[str, str]]:
         if answer.returncode != 0:  # such as a shim of pyenv for a version that is not selected
             if named:
                 raise ProofError(f"{python} does not run: {answer.stderr.strip()}")
-        elif version not in seen and re.fullmatch(r"3\.(1[1-9]|[2-9]\d)", version):
+        elif version not in seen and re.fullmatch(r"3\.(1[1-9]|[2-9]\d)\.\d+", version):
             seen.add(version)
             yield version, python
 
 
 def _installed() -> Iterator[str]:
     for name in NAMES:
-        if path := shutil.which(name):
-            yield path
+        for folder in os.get_exec_path():
+            if path := shutil.which(name, path=folder):
+                yield path
     versions = Path(os.environ.get("PYENV_ROOT", "~/.pyenv")).expanduser() / "versions"
     yield from (str(path) for name in NAMES for path in sorted(versions.glob(f"*/bin/{name}")))
 
@@ -132,8 +148,45 @@ def build(archive: Path, python: str, folder: Path) -> tuple[Path, float]:
     return wheel, time.monotonic() - begun_s
 
 
-def prove(wheel: Path, python: str, folder: Path) -> str:
-    """Return in a sentence what was proved of WHEEL, installed for PYTHON in FOLDER."""
+def prove_tls(commands: Path, folder: Path, port: int) -> str:
+    """Return in a sentence what a client of the demo's machine was told over TLS, at PORT."""
+    if shutil.which("openssl") is None:
+        return "TLS not tried: openssl is missing"
+    certificate, key = make_certificate(folder)
+    token, tokens = folder / "token", folder / "tokens"
+    for path, text in ((token, TOKEN), (tokens, f"admin me {TOKEN}\n")):
+        path.touch(0o600)
+        path.write_text(text, encoding="ascii")
+    address = f"127.0.0.1:{port}"
+    words: tuple[str | Path, ...] = ("demo", "--machine", "demo", "--serve", "--ipc", folder / "ipc")
+    words += ("--tcp", address, "--tokens", tokens, "--tls-certificate", certificate, "--tls-key", key)
+    said: list[str] = []
+    with begin(folder, commands / "canductor", *words) as serving:
+        assert serving.stdout is not None
+        try:
+            while "ready\n" not in said:
+                said.append(serving.stdout.readline())
+                if not said[-1]:
+                    raise ProofError(f"the demo does not serve: {''.join(said)}")
+            asked = (
+                "status",
+                "--at",
+                f"tls://{address}",
+                "--certificate",
+                certificate,
+                "--token-file",
+                token,
+            )
+            shown = run(folder, commands / "canductor", *asked, "--json")
+        finally:
+            serving.send_signal(signal.SIGINT)
+    if json.loads(shown).get("ok") is not True:
+        raise ProofError(f"the machine does not answer over TLS: {shown}")
+    return "answers over TLS"
+
+
+def prove(wheel: Path, python: str, folder: Path, port: int) -> str:
+    """Return in a sentence what was proved of WHEEL, installed for PYTHON in FOLDER; PORT is for it alone."""
     commands = environment(python, folder)
     run(folder, commands / "python", "-m", *PIP, "install", wheel)
     elsewhere = folder / "elsewhere"
@@ -148,7 +201,7 @@ def prove(wheel: Path, python: str, folder: Path) -> str:
     report = json.loads(shown.splitlines()[-1])
     if report.get("ok") is not True or not report.get("steps"):
         raise ProofError(f"the demo is not proved: {shown}")
-    return f"demo PROVED, {report['steps']} steps"
+    return f"demo PROVED, {report['steps']} steps; {prove_tls(commands, elsewhere, port)}"
 
 
 def main() -> int:
@@ -168,8 +221,8 @@ def main() -> int:
             print(f"python {version}: {wheel.name} built in {built_s:.0f} s", flush=True)
             with ThreadPoolExecutor(AT_ONCE) as pool:
                 proofs = {
-                    version: pool.submit(prove, wheel, python, folder / version)
-                    for version, python in pythons
+                    version: pool.submit(prove, wheel, python, folder / version, own_port(number))
+                    for number, (version, python) in enumerate(pythons)
                 }
                 for version, proof in proofs.items():
                     print(f"python {version}: {proof.result()}", flush=True)
