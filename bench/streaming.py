@@ -219,7 +219,7 @@ def first_motion(config: Path) -> None:
         with virtual_machine(config, folder, edges=True) as played:
             description = load_machine(str(played))
             with Program(typed, "typed") as program:
-                job = run_job(description, program, lambda _: None, on_output=lambda _: None)
+                job = run_job(description, program, on_output=lambda _: None)
                 asyncio.run(job)
         log = EdgeLog(folder / f"{description.nodes[0].name}.edges")
         first_ns = int(log.ticks_to_monotonic_ns(first_step(description, log)))

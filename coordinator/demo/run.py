@@ -48,7 +48,7 @@ def run_demo(options: DemoOptions) -> DemoReport:
 
 
 def print_and_prove(
-    hardware: Hardware, program: Program, host: Computer, on_progress: OnProgress = lambda _: None
+    hardware: Hardware, program: Program, host: Computer, on_progress: OnProgress | None = None
 ) -> DemoReport:
     """Print PROGRAM on HARDWARE, which HOST reaches, and prove every step; raises CanductorError."""
     description = hardware.description

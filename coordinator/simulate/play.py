@@ -86,7 +86,6 @@ class _Run:
             return await run_job(
                 self.stage.description,
                 program,
-                lambda _: None,
                 record=self.record,
                 on_output=lambda _: None,
                 on_ready=self._ready,

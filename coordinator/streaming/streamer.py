@@ -19,7 +19,7 @@ from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.standstill import StandstillTask
 from coordinator.streaming.timed_events import Due, DueEvents
 from coordinator.streaming.worker import SEND_AHEAD_S, START_LEAD_S, Cycle, MotionWorker
-from nodes.support.awake import call_between
+from nodes.support.awake import Pause
 from nodes.support.errors import CanductorError
 from nodes.support.work_thread import WorkThread
 
@@ -87,7 +87,7 @@ class Streamer:
         computer needs as much more lead."""
         self._busy = False
         """Whether a bus is busy, as of the last cycle."""
-        self._pause: asyncio.Future[None] | None = None
+        self._pause = Pause()
         """Between two cycles."""
         self._alone = False
         """Whether nothing else was to be done when the last pause ended."""
@@ -129,7 +129,7 @@ class Streamer:
     def call(self) -> None:
         """Begin the next cycle at once, from the control loop: there is something new to do."""
         self._called = True
-        self._end_pause()
+        self._pause.end()
 
     @property
     def held(self) -> str | None:
@@ -225,25 +225,15 @@ class Streamer:
             return
         self._machine.let_reports_wait(rests=pause_s == REST_CYCLE_S and self._standstill is None)
         loop = asyncio.get_running_loop()
-        self._pause = loop.create_future()
         ends_s = loop.time() + pause_s
         if pause_s == REST_CYCLE_S:  # together with the timers of modules
             ends_s = math.floor(ends_s / pause_s) * pause_s
         early_s = 0.0
         if pause_s == FULL_CYCLE_S:
             early_s = ALONE_EARLY_S if self._alone else FULL_EARLY_S
-        cancel = call_between(ends_s - early_s, ends_s, self._end_pause)
-        try:
-            await self._pause
-        finally:
-            cancel()
-            self._pause = None
+        await self._pause.between(ends_s - early_s, ends_s)
         self._alone = loop.time() >= ends_s
         self._rested = pause_s == REST_CYCLE_S and not self._called and self._at_rest()
-
-    def _end_pause(self) -> None:
-        if self._pause is not None and not self._pause.done():
-            self._pause.set_result(None)
 
     async def _attend(self, event: StandstillAction) -> None:
         """Perform EVENT once all moves before it are executed."""

@@ -8,12 +8,12 @@ from nodes.clock.clock import BROKEN, ClockEstimate, ClockEstimator
 from nodes.clock.wire_time import narrow
 from nodes.node.connector import ClockConnector
 from nodes.node.request_reply import Answer, Query, QueryTimeout, RequestReply
-from nodes.support.awake import sleep_between
+from nodes.support.awake import Pause
 from nodes.support.errors import CanductorError
 
 CLOCK: Final = Query("get_clock", "clock")
 UPTIME: Final = Query("get_uptime", "uptime")
-REST_INTERVAL_S: Final = 2.0
+REST_INTERVAL_S: Final = 4.0
 """At least, between two samples of a clock that is known while nothing needs it closely."""
 SLACK: Final = 0.1
 """By how much of the time between two samples the next may be later."""
@@ -45,17 +45,28 @@ class ClockKeeper:
         self.estimator = ClockEstimator(talk.dictionary.clock_freq_hz)
         self.ready = asyncio.Event()
         """Set when the clock is known, or when waiting for it has become pointless."""
-        self.rests = False
-        """Whether nothing needs the clock closely now."""
         self._talk = talk
         self._connector = connector
         self._on_estimate = on_estimate
         self._queries = queries
         self._on_answers = on_answers
         self._on_lost = on_lost
+        self._rests = False
+        self._pause = Pause()
         talk.link.on_silent = connector.suspect
         self._task = asyncio.get_running_loop().create_task(self._keep())
         self._task.add_done_callback(self._ended)
+
+    @property
+    def rests(self) -> bool:
+        """Whether nothing needs the clock closely now; when that ends, it is asked as soon as it is due."""
+        return self._rests
+
+    @rests.setter
+    def rests(self, rests: bool) -> None:
+        if self._rests and not rests:
+            self._pause.end()
+        self._rests = rests
 
     async def close(self) -> None:
         """Stop the queries; the estimate remains. Calling it again has no effect."""
@@ -85,10 +96,12 @@ class ClockKeeper:
                 self._on_lost(str(error))
                 return
             interval_s = self.estimator.next_sample_ns(0) * 1e-9
-            if self.rests and not self.estimator.in_doubt:
-                interval_s = max(interval_s, REST_INTERVAL_S)
-            pause_s = max(0.0, asked_s + interval_s - loop.time())  # the answer may have waited
-            await sleep_between(pause_s, pause_s + interval_s * SLACK)
+            due_s = asked_s + interval_s
+            if self._rests and not self.estimator.in_doubt:
+                rested_s = max(asked_s + REST_INTERVAL_S, loop.time())  # the answer may have waited
+                await self._pause.between(rested_s, rested_s + REST_INTERVAL_S * SLACK)
+            while loop.time() < due_s:  # as well when the rest has ended before
+                await self._pause.between(due_s, due_s + interval_s * SLACK)
 
     async def _sample(self) -> None:
         """Query the clock and what else is asked.

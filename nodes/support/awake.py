@@ -33,18 +33,30 @@ def call_between(earliest_s: float, latest_s: float, call: Callable[[], None]) -
     return loop.call_at(earliest_s, call).cancel
 
 
+class Pause:
+    """A sleep that ends when the loop is awake anyway (see ``call_between``), or by ``end``."""
+
+    def __init__(self) -> None:
+        self._over: asyncio.Future[None] | None = None
+        """Of who sleeps."""
+
+    async def between(self, earliest_s: float, latest_s: float) -> None:
+        """Sleep until the loop is awake between two of its times, the later one at most."""
+        over = self._over = asyncio.get_running_loop().create_future()
+        cancel = call_between(earliest_s, latest_s, self.end)
+        try:
+            await over
+        finally:
+            cancel()
+            self._over = None
+
+    def end(self) -> None:
+        """End it now; without effect when nobody sleeps."""
+        if self._over is not None and not self._over.done():
+            self._over.set_result(None)
+
+
 async def sleep_between(least_s: float, most_s: float) -> None:
     """Sleep for LEAST_S, and until the loop is awake anyway, MOST_S at most; see ``call_between``."""
-    loop = asyncio.get_running_loop()
-    over = loop.create_future()
-    now_s = loop.time()
-
-    def wake() -> None:
-        if not over.done():  # the task may have been cancelled in this iteration of the loop
-            over.set_result(None)
-
-    cancel = call_between(now_s + least_s, now_s + most_s, wake)
-    try:
-        await over
-    finally:
-        cancel()
+    now_s = asyncio.get_running_loop().time()
+    await Pause().between(now_s + least_s, now_s + most_s)

@@ -59,7 +59,6 @@ class Loaded:
         return await run_job(
             self.stage.description,
             program,
-            lambda _: None,
             on_output=lambda _: None,
             on_ready=self._ready,
             host=self.stage.host,

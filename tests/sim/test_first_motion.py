@@ -47,7 +47,6 @@ def first_step_s(folder: Path, load: float) -> float:
         job = run_job(
             stage.description,
             Program(typed, "typed"),
-            lambda _: None,
             on_output=lambda _: None,
             host=stage.host,
         )

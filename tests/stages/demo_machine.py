@@ -67,7 +67,6 @@ class TypedRun:
             run_job(
                 machine.description,
                 Program(self._input, "standard input"),
-                lambda _: None,
                 on_output=lambda told: self.told.append(told.text),
                 host=machine.host,
             )

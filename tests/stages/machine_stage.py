@@ -81,7 +81,6 @@ class MachineStage:
             lambda: run_job(
                 self.description,
                 Program.from_lines(lines, "part.gcode"),
-                lambda _: None,
                 on_output=on_output,
                 on_ready=on_ready,
                 host=self.host,

@@ -120,7 +120,6 @@ class Rig:
         await run_job(
             self.stage.description,
             program,
-            lambda _: None,
             on_output=lambda told: self._told_ns.update({told.text: self.stage.now_ns()}),
             on_ready=ready,
             host=self.stage.host,

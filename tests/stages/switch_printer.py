@@ -54,7 +54,6 @@ class SwitchPrinter:
         return await run_job(
             self.stage.description,
             Program.from_lines(lines, "part.gcode"),
-            lambda _: None,
             on_output=self._tell,
             host=self.stage.host,
         )

@@ -94,7 +94,7 @@ def test_print_ends_where_the_plan_says(processes: list[NodeProcess], tmp_path: 
     (tmp_path / "machine.cfg").write_text(MACHINE)
     description = load_machine(str(tmp_path / "machine.cfg"))
     with Program.from_lines(GCODE.splitlines(keepends=True)) as program:
-        outcome = asyncio.run(run_job(description, program, lambda _: None, on_output=lambda _: None))
+        outcome = asyncio.run(run_job(description, program, on_output=lambda _: None))
     assert outcome.positions == outcome.issued == END
     assert outcome.print_time_s > 2
     assert [node.link.bytes_invalid for node in outcome.nodes] == [0, 0]

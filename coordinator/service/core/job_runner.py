@@ -22,7 +22,7 @@ OnProgress = Callable[[Progress], None]
 async def run_job(
     description: MachineDescription,
     program: Program,
-    on_progress: OnProgress,
+    on_progress: OnProgress | None = None,
     *,
     record: PlanRecord | None = None,
     on_output: Callable[[ProgramOutput], None],

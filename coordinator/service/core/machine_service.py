@@ -186,7 +186,7 @@ class MachineService:
         program: Program,
         *,
         on_ready: Callable[[Machine], None],
-        on_progress: Callable[[Progress], None],
+        on_progress: Callable[[Progress], None] | None,
     ) -> Outcome:
         """Start the machine, print PROGRAM and return the result; ON_READY gets the machine before that.
 
@@ -206,11 +206,12 @@ class MachineService:
             await self._let_go()
 
     async def _print(
-        self, machine: Machine, program: Program, on_progress: Callable[[Progress], None]
+        self, machine: Machine, program: Program, on_progress: Callable[[Progress], None] | None
     ) -> Outcome:
         def look() -> None:
             self.look()
-            on_progress(job_progress(machine, motion, job, self.now_s))
+            if on_progress is not None:
+                on_progress(job_progress(machine, motion, job, self.now_s))
 
         async with self._stop_on_failure(machine):
             motion = self._begin_motion(machine, look, has_jobs=False)

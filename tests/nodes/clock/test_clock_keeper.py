@@ -187,9 +187,28 @@ def test_a_clock_that_nothing_needs_is_asked_less_often() -> None:
     assert bench.run(learn) == []
     steps_s = [b - a for a, b in zip(bench.sampled_s[:-1], bench.sampled_s[1:], strict=True)]
     assert steps_s[SETTLE_SAMPLES - 1 :] == pytest.approx(
-        [REST_INTERVAL_S] * 4 + [0.9843] * len(steps_s[SETTLE_SAMPLES + 3 :]), abs=1e-6
+        [REST_INTERVAL_S] * 3 + [0.9843] * len(steps_s[SETTLE_SAMPLES + 2 :]), abs=1e-6
     )
     assert len(steps_s) >= SETTLE_SAMPLES + 5
+
+
+@pytest.mark.parametrize(("rested_s", "asked_s"), [(0.5, 0.9843), (2.0, 2.0)])
+def test_a_clock_that_is_needed_again_is_asked_when_it_is_due(rested_s: float, asked_s: float) -> None:
+    bench = Bench()
+    woken_s: list[float] = []
+
+    async def learn(keeper: ClockKeeper) -> None:
+        keeper.rests = True
+        await keeper.ready.wait()
+        await asyncio.sleep(REST_INTERVAL_S + 0.1)
+        asked_last_s = bench.sampled_s[-1]
+        await asyncio.sleep(rested_s - 0.1)
+        keeper.rests = False
+        await asyncio.sleep(REST_INTERVAL_S)
+        woken_s.extend(second - asked_last_s for second in bench.sampled_s if second > asked_last_s)
+
+    assert bench.run(learn) == []
+    assert woken_s[:1] == pytest.approx([asked_s], abs=1e-3)
 
 
 def test_only_a_clock_in_doubt_is_in_a_hurry() -> None:
