@@ -19,6 +19,9 @@ _MARKABLE: Final = ("Template", "For", "If", "Scope", "Output")
 """Parts of a tree whose text goes straight to the output."""
 SENTENCE_MAX: Final = 200
 """Characters of what goes wrong in a template."""
+OUT_OF_MEMORY: Final = (MemoryError, SystemError)
+"""Jinja2 compiles a few lines for the traceback of the former; Python 3.13 without memory for that, either,
+raises the latter."""
 
 
 class Failed(Exception):  # noqa: N818 (an answer to the user)
@@ -54,7 +57,7 @@ class TemplateCompiler:
             raise Failed(error.lineno, error.message or "cannot be read") from None
         except RecursionError:
             raise Failed(1, "it is nested too deeply") from None
-        except MemoryError:
+        except OUT_OF_MEMORY:
             raise Failed(1, "it needs too much memory to be read", memory=True) from None
         return self.sandbox.template_class.from_code(self.sandbox, code, dict(self.sandbox.globals))
 
@@ -71,7 +74,7 @@ class TemplateCompiler:
             raise Failed(_line_of(error), str(error)) from None
         except RecursionError as error:
             raise Failed(_line_of(error), "a macro of the template calls itself without end") from None
-        except MemoryError as error:
+        except OUT_OF_MEMORY as error:
             raise Failed(
                 _line_of(error), "it needs too much memory; have it build less", memory=True
             ) from None
