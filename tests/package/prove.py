@@ -4,10 +4,10 @@ Usage: python -m tests.package.prove [--keep FOLDER] [PYTHON...]
 
 PYTHONs are this one and one of every other release found on the PATH or below pyenv, unless some are named;
 what could not build it is named and skipped. Debian's own is among them, which has not the last fixes of its
-version. The first one's pip builds the wheel from the source distribution, for all of them, since it is
-one of the stable ABI. For each, a new virtual environment in a temporary folder gets that wheel, with its
-dependencies from pip's index. There the demo prints a small program and has to end with its proof, and a
-machine that is served over TLS has to answer. Exit status 1 when anything fails; the last words say what.
+version. The first one builds the wheel from the source distribution, for all of them, since it is one of the
+stable ABI. For each, a new virtual environment in a temporary folder gets that wheel, with its dependencies
+from pip's index. There the demo prints a small program and has to end with its proof, and a machine that is
+served over TLS has to answer. Exit status 1 when anything fails; the last words say what.
 """
 
 import argparse
@@ -45,7 +45,8 @@ G1 Z0.6 F600
 """
 """Every stepper of the demo machine moves; two seconds."""
 DEMO: Final = ("--machine", "demo", "--json", "--gcode", "square.gcode")
-PIP: Final = ("pip", "-q", "--disable-pip-version-check")
+PIP: Final = (sys.executable, "-m", "pip", "-q", "--disable-pip-version-check", "--python")
+"""For another Python: to give each a pip of its own takes as long as to install the project."""
 PAGES: Final = "import coordinator.web.files as f; assert (f.FOLDER / 'index.html').is_file()"
 VERSION: Final = "import sys; print('%d.%d.%d' % sys.version_info[:3])"
 LOCATION: Final = "import coordinator; print(coordinator.__file__)"
@@ -135,7 +136,7 @@ def usable(named: list[str]) -> list[tuple[str, str]]:
 def environment(python: str, folder: Path) -> Path:
     """Return the folder of the commands of a new virtual environment for PYTHON, in FOLDER."""
     folder.mkdir()
-    run(folder, python, "-m", "venv", folder / "venv")
+    run(folder, python, "-m", "venv", "--without-pip", folder / "venv")
     return folder / "venv" / "bin"
 
 
@@ -143,7 +144,7 @@ def build(archive: Path, python: str, folder: Path) -> tuple[Path, float]:
     """Return the wheel of the source distribution ARCHIVE, built in FOLDER, and the seconds it took."""
     commands = environment(python, folder)
     begun_s = time.monotonic()
-    run(folder, commands / "python", "-m", *PIP, "wheel", "--no-deps", "--wheel-dir", folder, archive)
+    run(folder, *PIP, commands / "python", "wheel", "--no-deps", "--wheel-dir", folder, archive)
     (wheel,) = folder.glob("*.whl")
     return wheel, time.monotonic() - begun_s
 
@@ -188,7 +189,7 @@ def prove_tls(commands: Path, folder: Path, port: int) -> str:
 def prove(wheel: Path, python: str, folder: Path, port: int) -> str:
     """Return in a sentence what was proved of WHEEL, installed for PYTHON in FOLDER; PORT is for it alone."""
     commands = environment(python, folder)
-    run(folder, commands / "python", "-m", *PIP, "install", wheel)
+    run(folder, *PIP, commands / "python", "install", "--no-compile", wheel)
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
     where = Path(run(elsewhere, commands / "python", "-c", LOCATION).strip())
