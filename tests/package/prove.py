@@ -3,7 +3,7 @@
 Usage: python -m tests.package.prove [--keep FOLDER] [PYTHON...]
 
 PYTHONs are this one and one of every other release found on the PATH or below pyenv, unless some are named;
-what could not build it is named and skipped. Debian's own is among them, which has not the last fixes of its
+what could not build it is named and skipped. Debian's own is among them, which lacks later fixes of its
 version. The first one builds the wheel from the source distribution, for all of them, since it is one of the
 stable ABI. For each, a new virtual environment in a temporary folder gets that wheel, with its dependencies
 from pip's index. There the demo prints a small program and has to end with its proof, and a machine that is
@@ -27,7 +27,7 @@ from typing import Final
 
 from tests.coordinator.certificates import make_certificate
 from tests.package.build import ROOT, setup
-from tests.stages.processes import own_port
+from tests.stages.processes import Command, own_port
 
 NAMES: Final = tuple(f"python3.{minor}" for minor in range(11, 20))
 PROGRAM: Final = """\
@@ -45,8 +45,8 @@ G1 Z0.6 F600
 """
 """Every stepper of the demo machine moves; two seconds."""
 DEMO: Final = ("--machine", "demo", "--json", "--gcode", "square.gcode")
-PIP: Final = (sys.executable, "-m", "pip", "-q", "--disable-pip-version-check", "--python")
-"""For another Python: to give each a pip of its own takes as long as to install the project."""
+PIP: Final = ("pip", "-q", "--disable-pip-version-check")
+"""Of each environment: an old one does not run with a newer Python."""
 PAGES: Final = "import coordinator.web.files as f; assert (f.FOLDER / 'index.html').is_file()"
 VERSION: Final = "import sys; print('%d.%d.%d' % sys.version_info[:3])"
 LOCATION: Final = "import coordinator; print(coordinator.__file__)"
@@ -57,13 +57,6 @@ AT_ONCE: Final = 4
 
 class ProofError(Exception):
     """What is shipped does not work; the text says what was run and how it ended."""
-
-
-def begin(folder: Path, *words: str | Path) -> subprocess.Popen[str]:
-    """Begin the command WORDS in FOLDER, without anything of this environment's Python."""
-    return subprocess.Popen(
-        words, cwd=folder, env=_environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
 
 
 def _environment() -> dict[str, str]:
@@ -136,7 +129,7 @@ def usable(named: list[str]) -> list[tuple[str, str]]:
 def environment(python: str, folder: Path) -> Path:
     """Return the folder of the commands of a new virtual environment for PYTHON, in FOLDER."""
     folder.mkdir()
-    run(folder, python, "-m", "venv", "--without-pip", folder / "venv")
+    run(folder, python, "-m", "venv", folder / "venv")
     return folder / "venv" / "bin"
 
 
@@ -144,13 +137,13 @@ def build(archive: Path, python: str, folder: Path) -> tuple[Path, float]:
     """Return the wheel of the source distribution ARCHIVE, built in FOLDER, and the seconds it took."""
     commands = environment(python, folder)
     begun_s = time.monotonic()
-    run(folder, *PIP, commands / "python", "wheel", "--no-deps", "--wheel-dir", folder, archive)
+    run(folder, commands / "python", "-m", *PIP, "wheel", "--no-deps", "--wheel-dir", folder, archive)
     (wheel,) = folder.glob("*.whl")
     return wheel, time.monotonic() - begun_s
 
 
 def prove_tls(commands: Path, folder: Path, port: int) -> str:
-    """Return in a sentence what a client of the demo's machine was told over TLS, at PORT."""
+    """Serve the demo's machine over TLS at PORT and ask for its state; return in a sentence how that went."""
     if shutil.which("openssl") is None:
         return "TLS not tried: openssl is missing"
     certificate, key = make_certificate(folder)
@@ -158,38 +151,24 @@ def prove_tls(commands: Path, folder: Path, port: int) -> str:
     for path, text in ((token, TOKEN), (tokens, f"admin me {TOKEN}\n")):
         path.touch(0o600)
         path.write_text(text, encoding="ascii")
-    address = f"127.0.0.1:{port}"
-    words: tuple[str | Path, ...] = ("demo", "--machine", "demo", "--serve", "--ipc", folder / "ipc")
-    words += ("--tcp", address, "--tokens", tokens, "--tls-certificate", certificate, "--tls-key", key)
-    said: list[str] = []
-    with begin(folder, commands / "canductor", *words) as serving:
-        assert serving.stdout is not None
-        try:
-            while "ready\n" not in said:
-                said.append(serving.stdout.readline())
-                if not said[-1]:
-                    raise ProofError(f"the demo does not serve: {''.join(said)}")
-            asked = (
-                "status",
-                "--at",
-                f"tls://{address}",
-                "--certificate",
-                certificate,
-                "--token-file",
-                token,
-            )
-            shown = run(folder, commands / "canductor", *asked, "--json")
-        finally:
-            serving.send_signal(signal.SIGINT)
-    if json.loads(shown).get("ok") is not True:
-        raise ProofError(f"the machine does not answer over TLS: {shown}")
+    program, address = commands / "canductor", f"127.0.0.1:{port}"
+    words = ("demo", "--machine", "demo", "--serve", "--ipc", folder / "ipc", "--tcp", address)
+    secrets = ("--tokens", tokens, "--tls-certificate", certificate, "--tls-key", key)
+    asked = ("status", "--at", f"tls://{address}", "--certificate", certificate, "--token-file", token)
+    with Command(
+        *words, *secrets, program=(str(program),), folder=folder, environment=_environment()
+    ) as serving:
+        serving.stdout.wait_for("ready")
+        run(folder, program, *asked)
+        serving.signal(signal.SIGINT)
+        serving.end()
     return "answers over TLS"
 
 
 def prove(wheel: Path, python: str, folder: Path, port: int) -> str:
     """Return in a sentence what was proved of WHEEL, installed for PYTHON in FOLDER; PORT is for it alone."""
     commands = environment(python, folder)
-    run(folder, *PIP, commands / "python", "install", "--no-compile", wheel)
+    run(folder, commands / "python", "-m", *PIP, "install", "--no-compile", wheel)
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
     where = Path(run(elsewhere, commands / "python", "-c", LOCATION).strip())
@@ -227,7 +206,7 @@ def main() -> int:
                 }
                 for version, proof in proofs.items():
                     print(f"python {version}: {proof.result()}", flush=True)
-        except (ProofError, OSError, subprocess.SubprocessError) as error:
+        except (ProofError, AssertionError, OSError, subprocess.SubprocessError) as error:
             print(f"package: {error}", file=sys.stderr)
             return 1
         if options.keep:

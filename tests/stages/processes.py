@@ -110,13 +110,23 @@ class _Output:
 
 
 class Command:
-    """A ``canductor`` command while it runs; its standard input is a pipe."""
+    """A ``canductor`` command while it runs; its standard input is a pipe.
 
-    def __init__(self, *words: str | Path) -> None:
+    PROGRAM is another installation's, if it is given, FOLDER where it runs, and ENVIRONMENT what it inherits.
+    """
+
+    def __init__(
+        self,
+        *words: str | Path,
+        program: Sequence[str] = CANDUCTOR,
+        folder: Path = ROOT,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         self._began_s = time.monotonic()
         self.process = subprocess.Popen(
-            [*CANDUCTOR, *map(str, words)],
-            cwd=ROOT,
+            [*program, *map(str, words)],
+            cwd=folder,
+            env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

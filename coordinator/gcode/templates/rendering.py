@@ -20,8 +20,8 @@ _MARKABLE: Final = ("Template", "For", "If", "Scope", "Output")
 SENTENCE_MAX: Final = 200
 """Characters of what goes wrong in a template."""
 OUT_OF_MEMORY: Final = (MemoryError, SystemError)
-"""Jinja2 compiles a few lines for the traceback of the former; Python 3.13 without memory for that, either,
-raises the latter."""
+"""Jinja2 compiles a few lines for the traceback of the former. Where there is no memory for that, either,
+Python 3.13 raises the latter."""
 
 
 class Failed(Exception):  # noqa: N818 (an answer to the user)
