@@ -124,7 +124,7 @@ class Screen:
 
     def go(self, address: str) -> None:
         """Open the page to which the menu links with ADDRESS."""
-        self.page.locator(f"a[href$='{address}']").first.click()
+        press(self.page.locator(f"a[href$='{address}']").first)
 
     def check(self) -> None:
         """Raise Failed for temperatures that are no numbers, a host that is shown as dead, and complaints."""
@@ -134,7 +134,7 @@ class Screen:
         rows = self.page.locator("tr:visible", has_text="°C").all_inner_texts()
         if len(rows) < len(HEATERS) or not all(re.search(r"\d\s*°C", row) for row in rows):
             raise Failed(f"{self.name} shows these temperatures: {rows}")
-        self.page.locator(BELL).first.click()
+        press(self.page.locator(BELL).first)
         notes = self.page.locator(".menuable__content__active").first.inner_text()
         self.page.keyboard.press("Escape")
         if COMPLAINTS.search(notes):
@@ -151,6 +151,17 @@ class Screen:
         expected = EXPECTED if self.name == "mainsail" else (*EXPECTED, ABSENT_HOST)
         if message.type == "error" and not any(known.search(text) for known in expected):
             self._errors.append(text[:500])
+
+
+def press(target: Locator) -> None:
+    """Click on TARGET, wherever it is by then; it has to be one that could be clicked.
+
+    The pages move what they show whenever the machine's state changes: a click of the mouse that begins on a
+    button would sometimes end beside it, which presses nothing.
+    """
+    target.click(trial=True)
+    target.focus()
+    target.dispatch_event("click")
 
 
 def _whole(text: str) -> re.Pattern[str]:
@@ -190,17 +201,17 @@ def drive(screen: Screen, api: Moonraker, config: Path, pictures: Path | None) -
 def _home_and_jog(screen: Screen, api: Moonraker) -> None:
     page, mainsail = screen.page, screen.name == "mainsail"
     until(lambda: api.state() == "ready", "ready")
-    screen.button("ALL").click()
+    press(screen.button("ALL"))
     until(lambda: _field(api, "toolhead", "homed_axes") == "xyz", "homed")
     # Buttons that home an axis change their colour when it is shown as homed.
     label, colour = ("ALL", "primary") if mainsail else ("X", "btncolor")
     page.locator(f"button.{colour}:visible").filter(has_text=_whole(label)).first.wait_for()
     before_mm = _field(api, "toolhead", "position")[0]
     if mainsail:
-        screen.button("+10").click()
+        press(screen.button("+10"))
     else:
-        screen.button("10").click()
-        page.locator("button.px-2:visible").nth(FLUIDD_RIGHT).click()
+        press(screen.button("10"))
+        press(page.locator("button.px-2:visible").nth(FLUIDD_RIGHT))
     until(lambda: abs(_field(api, "toolhead", "position")[0] - before_mm - 10.0) < 1e-3, "a jog by 10 mm")
 
 
@@ -220,16 +231,16 @@ def _print(screen: Screen, api: Moonraker, pictures: Path | None) -> None:
 
 def _pause_resume_cancel(screen: Screen, api: Moonraker) -> None:
     page, mainsail = screen.page, screen.name == "mainsail"
-    _job_button(screen, "Pause", "warning").click()
+    press(_job_button(screen, "Pause", "warning"))
     until(lambda: api.print_state() == "paused", "paused")
-    _job_button(screen, "Resume", "success").click()
+    press(_job_button(screen, "Resume", "success"))
     until(lambda: api.print_state() == "printing", "printing again")
     if mainsail:  # its button for cancelling is there only while the job is paused
-        _job_button(screen, "Pause", "warning").click()
+        press(_job_button(screen, "Pause", "warning"))
         until(lambda: api.print_state() == "paused", "paused again")
-    _job_button(screen, "Cancel", "error").click()
+    press(_job_button(screen, "Cancel", "error"))
     if not mainsail:
-        page.locator(".v-dialog--active button:visible").filter(has_text=_whole("Yes")).first.click()
+        press(page.locator(".v-dialog--active button:visible").filter(has_text=_whole("Yes")).first)
     until(lambda: api.print_state() == "cancelled", "cancelled")
 
 
@@ -237,28 +248,28 @@ def _edit(screen: Screen, api: Moonraker, config: Path) -> None:
     """Add an output to the configuration in the front end's editor; wait until it is shown."""
     page, mainsail = screen.page, screen.name == "mainsail"
     screen.go("/config" if mainsail else "#/configure")
-    page.get_by_text(config.name, exact=True).locator("visible=true").first.click()
+    press(page.get_by_text(config.name, exact=True).locator("visible=true").first)
     page.locator(".cm-content" if mainsail else ".monaco-editor").first.click()
     page.keyboard.press("Control+Home")
     added, before = ADDED.format(name=screen.name), config.read_text()
     lines = f"[{added}]\npin: {ADDED_PINS[screen.name]}\n"
     page.keyboard.insert_text(lines)
-    screen.button("Save & Restart").click()
+    press(screen.button("Save & Restart"))
     until(lambda: config.read_text() == lines + before, "the file as edited")
     until(lambda: api.state() == "ready" and added in api.objects(), "ready with what was added")
-    page.locator("a[href='/']" if mainsail else "a[href$='#/']").first.click()
+    press(page.locator("a[href='/']" if mainsail else "a[href$='#/']").first)
     page.get_by_text(f"From {screen.name}", exact=False).locator("visible=true").first.wait_for()
 
 
 def _stop_and_restart(screen: Screen, api: Moonraker) -> None:
     page = screen.page
     if screen.name == "mainsail":
-        screen.button("Emergency Stop").click()
+        press(screen.button("Emergency Stop"))
     else:
-        page.locator("header button:visible").first.click()
+        press(page.locator("header button:visible").first)
     until(lambda: api.state() == "shutdown", "shutdown")
     page.get_by_text("emergency stop by a client").locator("visible=true").first.wait_for()
-    screen.button("Firmware Restart").click()
+    press(screen.button("Firmware Restart"))
     until(lambda: api.state() == "ready", "ready after the stop")
     screen.field("Heater Bed").wait_for()
 
@@ -271,9 +282,9 @@ def _print_from_list(screen: Screen) -> None:
         job = page.locator("tr:visible", has_text=re.compile(re.escape(JOB_NAME) + ".*kB", re.DOTALL)).first
     job.click(button="right")
     entry = _whole("Print start" if mainsail else "Print")
-    page.locator(".v-list:visible").get_by_text(entry).locator("visible=true").first.click()
+    press(page.locator(".v-list:visible").get_by_text(entry).locator("visible=true").first)
     if mainsail:  # it asks again
-        page.locator(".v-dialog--active button:visible").filter(has_text=_whole("Print")).first.click()
+        press(page.locator(".v-dialog--active button:visible").filter(has_text=_whole("Print")).first)
 
 
 def _job_button(screen: Screen, label: str, colour: str) -> Locator:
