@@ -1,7 +1,6 @@
 """``motion.dump``: what was planned and sent within the last seconds, for plotting."""
 
 import asyncio
-import time
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from operator import attrgetter
@@ -35,7 +34,8 @@ def plot_methods(service: MachineService) -> Iterator[Method]:
     async def dump(_caller: Caller, params: dict[str, Any]) -> Value:
         nonlocal rest_until_s
         motion, machine = service.ready_motion(), service.up_machine()
-        if dumping.locked() or time.monotonic() < rest_until_s:
+        clock_s = asyncio.get_running_loop().time
+        if dumping.locked() or clock_s() < rest_until_s:
             raise ApiError("busy", "another dump is being made, or was just now; ask again in a moment")
         async with dumping:
             now_s = motion.now_s
@@ -48,9 +48,9 @@ def plot_methods(service: MachineService) -> Iterator[Method]:
                 (s.node, machine.devices.steppers[s.name].oid): s.name for s in machine.description.steppers
             }
             moves = motion.trace.moves(since_s)
-            begun_s = time.monotonic()
+            begun_s = clock_s()
             made = await _dump(now_s, since_s, moves, senders, names)
-            rest_until_s = begun_s + (1 + REST) * (time.monotonic() - begun_s)
+            rest_until_s = begun_s + (1 + REST) * (clock_s() - begun_s)
             return made
 
     def path(_caller: Caller, params: dict[str, Any]) -> Value:
