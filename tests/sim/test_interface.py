@@ -129,7 +129,6 @@ async def _check_caller(interface: Interface, name: str, caller: Caller) -> None
             for method, (needed, _, outcome) in MATRIX.items()
             if method != STOP or scope == "watch"
         }
-        await asyncio.sleep(1)  # so soon after another's motion.dump there is none
         found = {method: await line.outcome(method, MATRIX[method][1]) for method in expected}
         assert found == expected, name
 

@@ -210,6 +210,18 @@ def test_what_front_ends_see(tmp_path: Path) -> None:
     machine.serve(go, node_commands=True)
 
 
+def test_dumps_rest_by_the_clock_of_the_loop(tmp_path: Path) -> None:
+    """A dump takes no virtual time; failed before, as the next one waited for the computer's clock."""
+    machine = DemoMachine(tmp_path)
+
+    async def go(stage: Served) -> None:
+        await stage.call("gcode.run", script="G28\nG1 X40 Y20 Z2 E2 F6000")
+        for _ in range(2):
+            assert (await stage.call("motion.dump", seconds=10))["moves"]["print_time"]
+
+    machine.serve(go)
+
+
 def test_motion_is_told_before_it_has_begun(tmp_path: Path) -> None:
     """In the first moments of a start; failed before, as the clocks of the nodes were not mapped yet."""
     machine = DemoMachine(tmp_path)
