@@ -155,8 +155,8 @@ class Screen:
 def press(target: Locator) -> None:
     """Click on TARGET, wherever it is by then; it has to be one that could be clicked.
 
-    The pages move what they show whenever the machine's state changes: a click of the mouse that begins on a
-    button would sometimes end beside it, which presses nothing.
+    The pages move what they show whenever the machine's state changes. When that happens between mousedown
+    and mouseup, the browser sends the button no click event.
     """
     target.click(trial=True)
     target.focus()
