@@ -23,6 +23,7 @@ from coordinator.gcode.events import Done, Event
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.parser import Command
 from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.gcode.status import Figures
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.steps.surface import Surface
 
@@ -44,7 +45,7 @@ class Call:
     """Names of the replaced commands that it stands in, the outermost first."""
     extruder: str = ""
     """The active extruder; empty where there is none."""
-    figures: Callable[[], Mapping[str, Mapping[str, object]]] = dict
+    figures: Callable[[], Figures] = dict
     """Return ``toolhead`` and ``gcode_move`` as they are there (gcode/status.py)."""
     while_printing: bool = False
     """Whether a client gives it while a job prints, which must not wait for it."""

@@ -7,7 +7,6 @@ real-time streamer drive the same ``step`` and act on its events (events.py).
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 from coordinator.gcode.absent_commands import ABSENT
 from coordinator.gcode.builtins import basic as basic_commands
@@ -46,7 +45,7 @@ from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.parser import Command, WordError, parse, quoted
 from coordinator.gcode.program import Program
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.gcode.status import motion_figures
+from coordinator.gcode.status import Figures, MotionStatus
 from coordinator.motion.planner.language import READ_IN_C
 from coordinator.motion.planner.planner import Feed, FeedStatus, Planner
 
@@ -387,7 +386,10 @@ class Job(ProgramContext):
         active = self.machine.active
         extruder = active.name if active is not None else ""
         position = self.machine.motor_position(planner.toolhead_position)
-        figures = partial(motion_figures, planner, self.machine)
+
+        def figures() -> Figures:
+            return MotionStatus.of(planner, self.machine).figures()
+
         return Call(
             command, self.line, position, planner.homed, callers, extruder, figures, self.while_printing
         )

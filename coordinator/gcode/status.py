@@ -1,51 +1,67 @@
 """How a program's moves stand while it is read, for macros: ``printer.toolhead``, ``printer.gcode_move``."""
 
 from collections.abc import Mapping
-from typing import cast
+from dataclasses import dataclass
+from typing import Self, cast
 
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.place import Place
-from coordinator.motion.planner.planner import Planner
+from coordinator.motion.planner.planner import Planner, PlannerState
+
+Figures = Mapping[str, Mapping[str, object]]
 
 
-def motion_figures(planner: Planner, machine: MachineState) -> Mapping[str, Mapping[str, object]]:
-    """Return where the moves read so far lead to, and what holds for those to come; mm, mm/s, mm/s².
+@dataclass(frozen=True, slots=True)
+class MotionStatus:
+    """Where the moves read so far lead to, and what holds for those to come."""
 
-    To be called in the thread that reads programs.
-    """
-    limits = planner.limits
-    active = machine.active
-    toolhead = {
-        "position": Place(*planner.toolhead_position),
-        "homed_axes": planner.homed.lower(),
-        "extruder": "" if active is None else active.name,
-        "axis_minimum": Place(*limits.position_min, 0.0),
-        "axis_maximum": Place(*limits.position_max, 0.0),
-        "max_velocity": planner.max_velocity,
-        "max_accel": planner.accel,
-        "minimum_cruise_ratio": planner.minimum_cruise_ratio,
-        "square_corner_velocity": planner.square_corner_velocity,
-        "print_time": planner.print_time_end_s,
-        "estimated_print_time": planner.print_time_end_s,
-        "stalls": 0,
-        "extra_axes": {} if active is None else {active.name: 3},
-    }
-    gcode_move = {
-        "gcode_position": Place(*planner.gcode_position),
-        "position": Place(*planner.toolhead_position),
-        "base": Place(*planner.gcode_base),
-        "homing_origin": Place(*planner.gcode_offset),
-        "speed": planner.speed_mm_s * 60.0,
-        "speed_factor": planner.speed_factor,
-        "extrude_factor": planner.extrude_factor,
-        "absolute_coordinates": not planner.relative,
-        "absolute_extrude": not planner.relative_extrusion,
-        "axis_map": {"X": 0, "Y": 1, "Z": 2, "E": 3},
-    }
-    return {"toolhead": toolhead, "gcode_move": gcode_move, **_extruders(machine), **_carriages(machine)}
+    state: PlannerState
+    active: str
+    """The extruder that E stands for; empty: there is none."""
+    parts: Figures
+    """Extruders and carriages."""
+
+    @classmethod
+    def of(cls, planner: Planner, machine: MachineState) -> Self:
+        """Return it; to be called in the thread that reads programs."""
+        active = machine.active
+        name = "" if active is None else active.name
+        return cls(planner.state(), name, {**_extruders(machine), **_carriages(machine)})
+
+    def figures(self) -> Figures:
+        """Return it as macros see it; mm, mm/s, mm/s²."""
+        state, limits = self.state, self.state.limits
+        toolhead = {
+            "position": Place(*state.toolhead_position),
+            "homed_axes": state.homed.lower(),
+            "extruder": self.active,
+            "axis_minimum": Place(*limits.position_min, 0.0),
+            "axis_maximum": Place(*limits.position_max, 0.0),
+            "max_velocity": state.max_velocity,
+            "max_accel": state.accel,
+            "minimum_cruise_ratio": state.minimum_cruise_ratio,
+            "square_corner_velocity": state.square_corner_velocity,
+            "print_time": state.print_time_end_s,
+            "estimated_print_time": state.print_time_end_s,
+            "stalls": 0,
+            "extra_axes": {self.active: 3} if self.active else {},
+        }
+        gcode_move = {
+            "gcode_position": Place(*state.gcode_position),
+            "position": Place(*state.toolhead_position),
+            "base": Place(*state.gcode_base),
+            "homing_origin": Place(*state.gcode_offset),
+            "speed": state.speed_mm_s * 60.0,
+            "speed_factor": state.speed_factor,
+            "extrude_factor": state.extrude_factor,
+            "absolute_coordinates": not state.relative,
+            "absolute_extrude": not state.relative_extrusion,
+            "axis_map": {"X": 0, "Y": 1, "Z": 2, "E": 3},
+        }
+        return {"toolhead": toolhead, "gcode_move": gcode_move, **self.parts}
 
 
-def _extruders(machine: MachineState) -> Mapping[str, Mapping[str, object]]:
+def _extruders(machine: MachineState) -> Figures:
     followed = {} if machine.filament is None else machine.filament.followed
     found: dict[str, dict[str, object]] = {}
     for stepper, queue in followed.items():
@@ -61,7 +77,7 @@ def _extruders(machine: MachineState) -> Mapping[str, Mapping[str, object]]:
     return found
 
 
-def _carriages(machine: MachineState) -> Mapping[str, Mapping[str, object]]:
+def _carriages(machine: MachineState) -> Figures:
     state, both = machine.carriage_state, machine.carriages
     if state is None or both is None:
         return {}
@@ -70,7 +86,7 @@ def _carriages(machine: MachineState) -> Mapping[str, Mapping[str, object]]:
     return {"dual_carriage": {"carriage_0": modes[0], "carriage_1": modes[1], "carriages": names}}
 
 
-def frames(figures: Mapping[str, Mapping[str, object]]) -> tuple[str, ...]:
+def frames(figures: Figures) -> tuple[str, ...]:
     """Return the frames that a program has, each as a line: GET_POSITION."""
     at = figures["gcode_move"]
     return (

@@ -355,7 +355,7 @@ class Gateway:
         motion, machine = self._service.motion, self._service.machine
         if motion is None or machine is None or machine.stopped is not None:
             return
-        active = motion.planned.figures.get("toolhead", {}).get("extruder")
+        active = motion.planned.status.active
         for connection in reading:
             for dump in connection.client.move_dumps:
                 rows = dump.take(motion.trace, motion.now_s, active)

@@ -11,26 +11,21 @@ Objects = dict[str, dict[str, Any]]
 
 def motion_objects(motion: "Motion", described: "MachineDescription", *, stopped: bool) -> Objects:
     """Return them, with extruders' and carriages' figures; positions are lists of X Y Z E in mm."""
-    planned = motion.planned
-    figures = planned.figures
-    if not figures:
-        return idle_objects(described)
-    objects: Objects = {name: dict(fields) for name, fields in figures.items()}
+    status = motion.planned.status
+    objects: Objects = {name: dict(fields) for name, fields in status.figures().items()}
     toolhead, move = objects["toolhead"], objects["gcode_move"]
     for fields in (toolhead, move):
         fields.update((name, list(value)) for name, value in fields.items() if isinstance(value, tuple))
     toolhead["homed_axes"] = "".join(axis for axis in "xyz" if axis in toolhead["homed_axes"])
     toolhead["print_time"] = round(float(toolhead["print_time"]), 3)
     toolhead["estimated_print_time"] = toolhead["print_time"] if stopped else round(motion.now_s, 3)
-    if toolhead["extruder"]:
-        toolhead["extra_axes"] = {toolhead["extruder"]: 3}
-    move["gcode_position"] = [round(value * planned.unit_mm, 6) for value in move["gcode_position"]]
+    move["gcode_position"] = [round(value * status.state.unit_mm, 6) for value in move["gcode_position"]]
     objects["motion_report"] = _report(motion, described, stopped=stopped)
     return objects
 
 
 def _report(motion: "Motion", described: "MachineDescription", *, stopped: bool) -> dict[str, Any]:
-    position, speed, extruder = motion.planned.position, 0.0, 0.0
+    position, speed, extruder = motion.planned.state.toolhead_position, 0.0, 0.0
     if not stopped:
         moment = motion.moment()
         position, speed, extruder = moment.position, moment.velocity_mm_s, moment.extruder_mm_s

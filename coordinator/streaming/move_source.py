@@ -1,12 +1,13 @@
 """Interfaces of the pipeline: a source of moves, and an observer of moves and commands."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from coordinator.gcode.events import Event, Notice, Reply
 from coordinator.gcode.machine_state import MachineState
-from coordinator.motion.planner.planner import Planner, Position
+from coordinator.gcode.status import MotionStatus
+from coordinator.motion.planner.planner import Planner, PlannerState
 
 ProgramOutput = Reply | Notice
 
@@ -61,27 +62,17 @@ class Witness(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """Where the planner was after the latest visit, in mm; X Y Z E."""
+    """Where the planner was after the latest visit."""
 
-    position: Position
-    """The machine's frame: the end of the last move read."""
-    gcode: Position
-    """The same in the frame and the units of the program."""
-    base: Position
-    """The program's origin in the machine's frame."""
-    homed: str
-    """Letters of the homed axes."""
-    speed_factor: float
-    extrude_factor: float
+    status: MotionStatus
     stands_from_s: float | None
     """Print time from which nothing moves any more; None: there is more to plan."""
     steps_sent: tuple[int, ...] = ()
     """By stepper: where its node will count it when all commands in batches are executed."""
     last_step_clocks: tuple[int, ...] = ()
     """By stepper: its node's 64-bit clock at the last of those steps; 0: there is none."""
-    offset: Position = (0.0, 0.0, 0.0, 0.0)
-    """SET_GCODE_OFFSET."""
-    figures: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
-    """``toolhead``, ``gcode_move``, extruders and carriages as macros see them (gcode/figures.py)."""
-    unit_mm: float = 1.0
-    """Of the program: 25.4 after G20."""
+
+    @property
+    def state(self) -> PlannerState:
+        """The end of the last move read, and what holds for the next."""
+        return self.status.state

@@ -20,7 +20,7 @@ from coordinator.gcode.events import (
     Timed,
     Wait,
 )
-from coordinator.gcode.status import motion_figures
+from coordinator.gcode.status import MotionStatus
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.steps.steps import Issued, StepGenerator
 from coordinator.runtime.machine import Machine
@@ -193,18 +193,10 @@ class MotionWorker:
         planner = self._planner
         stands = planner.at_standstill and not planner.take().count
         return Planned(
-            position=planner.toolhead_position,
-            gcode=planner.gcode_position,
-            base=planner.gcode_base,
-            homed=planner.homed,
-            speed_factor=planner.speed_factor,
-            extrude_factor=planner.extrude_factor,
+            MotionStatus.of(planner, self._job.machine),
             stands_from_s=self.pipeline.moved_until + self.steps.lag_s if stands else None,
             steps_sent=tuple(self._count(stepper) for stepper in steppers),
             last_step_clocks=tuple(stepper.issued_clock for stepper in steppers),
-            offset=planner.gcode_offset,
-            figures=motion_figures(planner, self._job.machine),
-            unit_mm=planner.unit_mm,
         )
 
     def _still_waiting(self, event: Event | None, now: float) -> bool:

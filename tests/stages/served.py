@@ -125,7 +125,7 @@ class Served:
     def planned(self) -> Position:
         """Where the last move ends."""
         assert self.service.motion is not None
-        return self.service.motion.planned.position
+        return self.service.motion.planned.state.toolhead_position
 
     async def check_positions(self) -> dict[str, int]:
         """Make sure that every stepper stands where the plan says, by its node's count; return the counts."""

@@ -8,7 +8,7 @@ from coordinator.gcode.events import Reply
 from coordinator.gcode.machine_state import DEFAULT_STATE, SavedState
 from coordinator.gcode.parameters import flag
 from coordinator.gcode.parser import Command, WordError, number, quoted
-from coordinator.gcode.status import frames, motion_figures
+from coordinator.gcode.status import MotionStatus, frames
 from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus, Planner
 
 MOVE_SPEED_MM_S: Final = 50.0
@@ -187,7 +187,7 @@ def come_back(
 
 def get_position(job: ProgramContext, _command: Command) -> bool:
     """GET_POSITION where nothing is connected: the frames of the program."""
-    for text in frames(motion_figures(job.planner, job.machine)):
+    for text in frames(MotionStatus.of(job.planner, job.machine).figures()):
         job.emit(Reply(job.line, text))
     return True
 

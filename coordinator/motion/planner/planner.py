@@ -26,6 +26,7 @@ from coordinator.motion.planner.values import (
     FaultKind,
     Feed,
     FeedStatus,
+    PlannerState,
     Position,
     Slowed,
     Trapezoids,
@@ -44,6 +45,7 @@ __all__ = [
     "Feed",
     "FeedStatus",
     "Planner",
+    "PlannerState",
     "Position",
     "Slowed",
     "Trapezoids",
@@ -236,6 +238,29 @@ class Planner:
         self._core.plan_until = print_time_s
 
     # ---- Where things are ----
+
+    def state(self) -> PlannerState:
+        """Return all that programs are told of, at once."""
+        core, state, limits = self._core, self._state, self._core.limits
+        return PlannerState(
+            toolhead_position=self.toolhead_position,
+            gcode_position=self.gcode_position,
+            gcode_base=self.gcode_base,
+            gcode_offset=self.gcode_offset,
+            homed=self.homed,
+            speed_mm_s=state.speed,
+            speed_factor=state.speed_factor,
+            extrude_factor=state.extrude_factor,
+            unit_mm=state.unit,
+            relative=bool(state.relative),
+            relative_extrusion=bool(state.relative_extrude),
+            max_velocity=limits.max_velocity,
+            accel=core.accel,
+            minimum_cruise_ratio=limits.minimum_cruise_ratio,
+            square_corner_velocity=limits.square_corner_velocity,
+            print_time_end_s=core.print_time,
+            limits=self.limits,
+        )
 
     @property
     def toolhead_position(self) -> Position:

@@ -35,6 +35,34 @@ class Feed(NamedTuple):
     """Number of the line at the offset, the first being 1."""
 
 
+class PlannerState(NamedTuple):
+    """Where the moves read so far lead to, and what holds for those to come; mm, mm/s, mm/s², s."""
+
+    toolhead_position: Position
+    """In the machine's frame."""
+    gcode_position: Position
+    """The same in the frame and the units of the program."""
+    gcode_base: Position
+    """The program's origin in the machine's frame."""
+    gcode_offset: Position
+    """SET_GCODE_OFFSET."""
+    homed: str
+    """Letters of the homed axes."""
+    speed_mm_s: float
+    speed_factor: float
+    extrude_factor: float
+    unit_mm: float
+    relative: bool
+    relative_extrusion: bool
+    max_velocity: float
+    accel: float
+    minimum_cruise_ratio: float
+    square_corner_velocity: float
+    print_time_end_s: float
+    limits: MotionLimits
+    """What is configured."""
+
+
 class FaultKind(IntEnum):
     """Why a move was refused."""
 

@@ -151,7 +151,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         motion = service.ready_motion()
         await motion.begun.wait()
         output = position_figures(motion)
-        output["offset"] = axes(motion.planned.offset)
+        output["offset"] = axes(motion.planned.state.gcode_offset)
         output["steppers"] = _stepper_figures(service.up_machine(), motion)
         if params["ask_nodes"]:
             output |= _node_figures(service.up_machine(), await steps.ask())

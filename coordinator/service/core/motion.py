@@ -5,6 +5,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 
 from coordinator.gcode.events import Notice
+from coordinator.gcode.status import MotionStatus
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.feeder import Feeder, QueuedWork
@@ -17,8 +18,6 @@ from coordinator.streaming.move_source import Planned, ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.program_machine import machine_state
 from coordinator.streaming.streamer import Streamer
-
-UNMOVED = Planned((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, "", 1.0, 1.0, 0.0)
 
 
 class Motion:
@@ -49,7 +48,7 @@ class Motion:
         )
         self.trace = MotionTrace(len(machine.moving))
         self._toolpath = Toolpath()
-        self.planned = UNMOVED
+        self.planned = Planned(MotionStatus.of(self.feeder.planner, self.feeder.machine), 0.0)
         self.lead = MotionLead()
         self.streamer = Streamer(
             machine,
@@ -135,8 +134,8 @@ class Motion:
         now_s = self.now_s
         if self.standing:
             found = self.trace.at(now_s)
-            return Moment(self.planned.position, 0.0, found.line if found else 0, moving=False)
-        return self.trace.at(now_s) or Moment(self.planned.position, 0.0, 0, moving=False)
+            return Moment(self.planned.state.toolhead_position, 0.0, found.line if found else 0, moving=False)
+        return self.trace.at(now_s) or Moment(self.planned.state.toolhead_position, 0.0, 0, moving=False)
 
     @property
     def toolpath(self) -> Toolpath:

@@ -124,7 +124,7 @@ class _Kept:
         held = None if mesh is None else mesh.held()
         if self._tilt is None and held is None:
             return {}
-        x, y, z, _ = (motion.trace.at(motion.now_s) or motion.planned).position
+        x, y, z, _ = motion.moment().position
         if self._tilt is not None:
             return {"bed_mm": self._tilt.added_mm((x, y, z))}
         assert mesh is not None
@@ -215,7 +215,7 @@ class Recovery:
         motion = self._service.motion
         if motion is None:
             return None
-        end_mm = motion.planned.position[2]
+        end_mm = motion.planned.state.toolhead_position[2]
         low, high = motion.trace.heights(motion.now_s) or (end_mm, end_mm)
         return (round(min(low, end_mm), 4), round(max(high, end_mm), 4))
 
@@ -226,8 +226,8 @@ class Recovery:
         return {
             "z": heights,
             "offset": list(motion.feeder.planner.gcode_offset),
-            "speed_factor": motion.planned.speed_factor,
-            "extrude_factor": motion.planned.extrude_factor,
+            "speed_factor": motion.planned.state.speed_factor,
+            "extrude_factor": motion.planned.state.extrude_factor,
             **kept.hot(),
             **kept.mesh(motion),
         }
@@ -257,7 +257,7 @@ class Recovery:
             await self._do(found, LinesWork(hot or ["M400"], name="recover"))
             if way.z_mm is not None:
                 await self._do(found, TakeHeight((), "recover", z_mm=way.z_mm))
-            if way.up_mm is not None and way.up_mm > motion.planned.position[2]:
+            if way.up_mm is not None and way.up_mm > motion.planned.state.toolhead_position[2]:
                 await self._do(found, MoveWork({"Z": way.up_mm}, LIFT_MM_S, relative=False, name="recover"))
             mesh = self._mesh_lines(found)
             lines = [*way.homing, *work.reached.lines, *mesh, *blown, "M400"]
@@ -293,7 +293,7 @@ class Recovery:
             raise ApiError(
                 "bad_params", f"{found.file} was interrupted at line {found.line}, before {how.line}"
             )
-        missing = [axis for axis in motion.feeder.axes if axis not in motion.planned.homed]
+        missing = [axis for axis in motion.feeder.axes if axis not in motion.planned.state.homed]
         if missing and not how.home:
             raise ApiError(
                 "not_ready",
@@ -309,7 +309,7 @@ class Recovery:
         if z_mm is not None and how.z_mm is None and isinstance(bed_mm := found.held.get("bed_mm"), float):
             z_mm += bed_mm
         machine = self._service.up_machine()
-        homed, part_mm = motion.planned.homed, max(part_mm, z_mm or 0.0)
+        homed, part_mm = motion.planned.state.homed, max(part_mm, z_mm or 0.0)
         return plan_resume_homing(machine.description, machine.modules, homed, part_mm=part_mm, z_mm=z_mm)
 
     def _mesh_lines(self, found: Interrupted) -> list[str]:

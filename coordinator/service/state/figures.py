@@ -114,17 +114,17 @@ def job_figures(job: "JobRun | None", now_s: float) -> dict[str, Value]:
 
 def position_figures(motion: "Motion") -> dict[str, Value]:
     """Return where the machine is, in all frames; mm, program units for ``gcode``."""
-    moment, planned = motion.moment(), motion.planned
+    moment, state = motion.moment(), motion.planned.state
     return {
         "commanded": axes(moment.position),
-        "planned": axes(planned.position),
-        "gcode": axes(planned.gcode),
-        "origin": axes(planned.base),
+        "planned": axes(state.toolhead_position),
+        "gcode": axes(state.gcode_position),
+        "origin": axes(state.gcode_base),
         "velocity_mm_s": round(moment.velocity_mm_s, 3),
         "moving": not motion.standing,
-        "homed": planned.homed,
-        "speed_factor": planned.speed_factor,
-        "extrude_factor": planned.extrude_factor,
+        "homed": state.homed,
+        "speed_factor": state.speed_factor,
+        "extrude_factor": state.extrude_factor,
         "print_time_s": round(motion.now_s, 3),
     }
 

@@ -1,14 +1,13 @@
 """Where the machine is, from the moves it was given; a numeric integral is the witness."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from coordinator.assembly.load import load_machine
+from coordinator.gcode.machine_state import MachineState
+from coordinator.gcode.status import MotionStatus
 from coordinator.motion.moves import read_moves
 from coordinator.motion.planner.planner import Planner
-from coordinator.service.core.motion import UNMOVED
 from coordinator.service.state.trace import (
     BATCH_BYTES_MAX,
     BATCHES_KEEP_S,
@@ -17,7 +16,13 @@ from coordinator.service.state.trace import (
     MotionTrace,
     Sent,
 )
+from coordinator.streaming.move_source import Planned
 from coordinator.support.examples import DEMO_MACHINE
+
+
+def at_rest(steps_sent: tuple[int, ...] = (), last_step_clocks: tuple[int, ...] = ()) -> Planned:
+    planner = Planner(load_machine(str(DEMO_MACHINE)).limits)
+    return Planned(MotionStatus.of(planner, MachineState()), 0.0, steps_sent, last_step_clocks)
 
 
 def planned(lines: bytes) -> tuple[Planner, MotionTrace]:
@@ -82,7 +87,7 @@ def test_memory_is_bounded_and_the_newest_stays() -> None:
     planner.flush()
     trace.see_moves(planner.take().pointer, 1)
     assert len(trace.moves(0.0)) < MOVES_MAX / 4
-    sent = replace(UNMOVED, steps_sent=(7,), last_step_clocks=(99,))
+    sent = at_rest(steps_sent=(7,), last_step_clocks=(99,))
     for number in range(100):
         trace.see_sent([(0, bytes([number]) * (BATCH_BYTES_MAX // 10))], sent)
     assert sum(map(len, trace.batches(0))) <= BATCH_BYTES_MAX
@@ -98,9 +103,9 @@ def test_commands_of_long_ago_are_forgotten() -> None:
     trace = MotionTrace(2)
     for now_s in range(100):
         trace.forget_before_s = now_s - KEEP_S
-        trace.see_sent([(0, bytes((now_s,)))], UNMOVED)
+        trace.see_sent([(0, bytes((now_s,)))], at_rest())
         if now_s == 0:
-            trace.see_sent([(1, b"long ago")], UNMOVED)
+            trace.see_sent([(1, b"long ago")], at_rest())
     kept = [batch[0] for batch in trace.batches(0)]
     assert kept == list(range(99 - round(BATCHES_KEEP_S), 100))
     assert trace.batches_after(0, 98) == (100, (b"\x62", b"\x63"))
