@@ -32,6 +32,7 @@ from coordinator.support.values import Value
 from nodes.bus.assign import Uuid
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
+from nodes.clock.clock import ClockEstimate
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.link import IOStats, Link
@@ -144,6 +145,8 @@ class Machine:
             self.policies, bring_back=self._bring_back, on_notice=on_notice, now_s=lambda: host.now() * 1e-9
         )
         self._job: PausableJob | None = None
+        self._jumps: dict[str, int] = {}
+        """By node: how often its clock has jumped."""
         self._waking: set[Node] = set()
         self._failed = asyncio.Event()
         self._stopped_at_ns = 0
@@ -255,6 +258,12 @@ class Machine:
         if name not in self.nodes:
             raise CanductorError(f"there is no node {name!r}; there are {', '.join(self.nodes)}")
         return self.nodes[name]
+
+    def _clock_estimated(self, node: Node, _: ClockEstimate) -> None:
+        jumps = self._jumps.get(node.name, 0)
+        self._jumps[node.name] = node.clock.jumps
+        if node.clock.jumps > jumps and self._job is not None:
+            self._job.call()  # it looks for jumps in every cycle; none of its moves must go on
 
     @contextlib.contextmanager
     def job(self, gate: PausableJob) -> Iterator[None]:
@@ -390,6 +399,7 @@ class Machine:
                     self._build_config(node),
                     may_be_absent=node.policy is NodePolicy.OPTIONAL,
                     on_state=self._node_changed,
+                    on_clock=self._clock_estimated,
                 ),
             )
 
@@ -411,6 +421,7 @@ class Machine:
                 self._build_config(node),
                 may_be_absent=node.policy is NodePolicy.OPTIONAL,
                 on_state=self._node_changed,
+                on_clock=self._clock_estimated,
             ),
         )
 

@@ -16,13 +16,16 @@ LAST_TRY_S: Final = 10.0
 
 
 class PausableJob(Protocol):
-    """A job that can be made to wait."""
+    """A job that can be made to wait, or to hurry."""
 
     def hold(self, cause: str) -> None:
         """Bring the job to a standstill; CAUSE is a sentence."""
 
     def release(self) -> None:
         """Resume the job; no effect on one that is not held."""
+
+    def call(self) -> None:
+        """Have the job look at once at what has happened."""
 
 
 class NodeRecovery:

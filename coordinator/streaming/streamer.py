@@ -18,14 +18,14 @@ from coordinator.streaming.move_source import MoveSource, Planned, ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.standstill import StandstillTask
 from coordinator.streaming.timed_events import Due, DueEvents
-from coordinator.streaming.worker import SEND_AHEAD_S, START_LEAD_S, Cycle, MotionWorker
+from coordinator.streaming.worker import MAKE_AHEAD_S, START_LEAD_S, Cycle, MotionWorker
 from nodes.support.awake import Pause
 from nodes.support.errors import CanductorError
 from nodes.support.work_thread import WorkThread
 
 CYCLE_S: Final = 0.05
-FULL_CYCLE_S: Final = 0.6
-"""While planner and commands reach as far ahead as they may; taken off the lead of SEND_AHEAD_S."""
+FULL_CYCLE_S: Final = 0.9
+"""While planner and commands reach as far ahead as they may; taken off the lead of MAKE_AHEAD_S."""
 FULL_EARLY_S: Final = 0.1
 """So much earlier it comes when the loop is awake anyway."""
 ALONE_EARLY_S: Final = 0.3
@@ -209,7 +209,7 @@ class Streamer:
         if self.held is not None:
             return CYCLE_S
         ahead_s = self.worker.steps.generated_until - self.print_time_now()
-        if isinstance(cycle.event, Full) and ahead_s > SEND_AHEAD_S - CYCLE_S:
+        if isinstance(cycle.event, Full) and ahead_s > MAKE_AHEAD_S - CYCLE_S:
             return BUSY_CYCLE_S if self._busy else FULL_CYCLE_S
         if isinstance(cycle.event, StandstillAction) and self._standstill is not None:
             return REST_CYCLE_S

@@ -32,9 +32,10 @@ from coordinator.streaming.timed_events import Due
 
 PLAN_AHEAD_S: Final = 2.0
 """Moves are planned so far ahead of now; beyond, the g-code waits. A pause takes so long; what it leaves
-beyond SEND_AHEAD_S is for sources that stall, and for lines that take longer to read than to carry out."""
-SEND_AHEAD_S: Final = 1.2
-"""Step commands are made so far ahead of now; the clocks of the nodes are predicted over this long."""
+beyond MAKE_AHEAD_S is for sources that stall, and for lines that take longer to read than to carry out."""
+MAKE_AHEAD_S: Final = 1.5
+"""Step commands are made so far ahead of now; the clocks of the nodes are predicted over this long. Links
+send them later (LinkSettings.ahead_s), so that less goes on when this program is gone."""
 START_LEAD_S: Final = 0.25
 """From standstill, the first move begins so far ahead of now."""
 RUN_DRY_S: Final = 0.8
@@ -266,14 +267,14 @@ class MotionWorker:
         return self._planner.print_time_end_s < now + RUN_DRY_S and not self._planner.at_standstill
 
     def _generate(self, now: float) -> None:
-        """Make the commands up to SEND_AHEAD_S from now, with every node's clock steered first."""
+        """Make the commands up to MAKE_AHEAD_S from now, with every node's clock steered first."""
         self._jumps.look(now, self.pipeline.moved_until + self.steps.lag_s)
         while True:
             complete = self.pipeline.transfer()
             self._steer()
             standing = complete and self._planner.at_standstill
             end = self.pipeline.appended_until
-            until = min(end, now + SEND_AHEAD_S)
+            until = min(end, now + MAKE_AHEAD_S)
             flush = standing and until >= end
             # At rest the border moves on with time, so that the clocks are steered at all times.
             self.pipeline.generate(max(until, now + REST_BORDER_S) if flush else until, flush=flush)

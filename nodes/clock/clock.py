@@ -41,6 +41,8 @@ BROKEN: Final = 8
 JUMP_S: Final = 1e-3
 """From so far off on, a clock whose estimate begins again has jumped. A host whose own clock is slewed, by
 500 ppm at most as usual, is less than that off by then."""
+LATELY_NS: Final = 3_000_000_000
+"""A jump that was found within this time explains what a node makes of commands that were made before."""
 GAP_NS: Final = 600_000_000_000
 """Silence after which the filter starts again: the temperature may have changed arbitrarily."""
 AHEAD_S: Final = 1.0
@@ -125,6 +127,7 @@ class ClockEstimator:
         """How often the clock has jumped since it was first known."""
         self.jump_s = 0.0
         """By how much it did the last time."""
+        self._jump_found_ns = 0
         self.accepted = 0
         self.unusable = 0
         """Number of answers whose times are unknown (a repeated block), implausible or impossible."""
@@ -176,6 +179,11 @@ class ClockEstimator:
         ahead_s = (ticks - last.ticks_at(HostTime(now_ns))) / self._freq_hz
         return ahead_s if ahead_s > last.asymmetry_s + self._error_s(last, now_ns) else 0.0
 
+    def jumped_lately_s(self, now_ns: int) -> float:
+        """Return by how much the clock jumped, if that was found within LATELY_NS before NOW_NS, else 0."""
+        lately = self.jumps and now_ns - self._jump_found_ns < LATELY_NS
+        return self.jump_s if lately else 0.0
+
     @property
     def in_doubt(self) -> bool:
         """Return whether more samples are needed soon."""
@@ -207,7 +215,7 @@ class ClockEstimator:
                 return False
             # On a busy bus the answers may only show by how much the estimate was off, within their times.
             if not _is_one_clock(self._used, reading, last.freq_hz):
-                self._note_jump((ticks - last.ticks_at(middle_ns)) / self._freq_hz)
+                self._note_jump((ticks - last.ticks_at(middle_ns)) / self._freq_hz, middle_ns)
             self._restart(middle_ns, ticks)
         self._forget_contradictions()
         self._used = reading
@@ -239,10 +247,11 @@ class ClockEstimator:
             _is_one_clock(first, other, freq_hz) for other in others
         )
 
-    def _note_jump(self, jump_s: float) -> None:
+    def _note_jump(self, jump_s: float, found_ns: int) -> None:
         if abs(jump_s) >= JUMP_S:
             self.jumps += 1
             self.jump_s = jump_s
+            self._jump_found_ns = found_ns
 
     def _forget_contradictions(self) -> None:
         self._impossible.clear()

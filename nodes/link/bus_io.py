@@ -99,8 +99,10 @@ class LinkIO:
             )
         if not 1e-3 <= settings.lost_after_s <= 3600:
             raise LinkError(f"{where}: lost_after_s={settings.lost_after_s} is not within 0.001..3600 s")
-        lost_after_ns = round(settings.lost_after_s * 1e9)
-        c_settings = self._ffi.new("struct link_settings *", (settings.receive_window, lost_after_ns))
+        if not 0 <= settings.ahead_s <= 3600:
+            raise LinkError(f"{where}: ahead_s={settings.ahead_s} is not within 0..3600 s")
+        times_ns = (round(seconds * 1e9) for seconds in (settings.lost_after_s, settings.ahead_s))
+        c_settings = self._ffi.new("struct link_settings *", (settings.receive_window, *times_ns))
         number = self._ffi.new("uint32_t *")
         status = self._lib.io_open_link(self._bus.live(), nodeid or 0, c_settings, number)
         if status == self._lib.IO_TAKEN:

@@ -128,6 +128,9 @@ class LinkSettings:
     """Bytes the node can buffer, at least 64: RECEIVE_WINDOW of its dictionary."""
     lost_after_s: float = 1.0
     """Time without an acknowledgement after which the link is lost."""
+    ahead_s: float = 1.2
+    """Motion is sent so long before it is due at most, half of that at least: a node goes on for so long when
+    its host is gone. 0: it is sent as soon as the node has room for it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -591,20 +591,20 @@ class Node:
             return
         text = self.dictionary.enum_name("static_string_id", static_string_id)
         known = [words for explain in self._explain if (words := explain(text))]
-        ahead_s = 0.0 if clock is None else self._clock_ahead_s(clock)
-        if ahead_s:
-            known.append(
-                f"its clock was {ahead_s * 1e3:.1f} ms ahead of what the host knows of it: "
-                "its oscillator is failing, or the host was suspended"
-            )
+        if off := self._clock_off(clock):
+            known.append(f"{off}: its oscillator is failing, or the host was suspended")
         sentence = shutdown_sentence(self.name, text) + (f" ({'; '.join(known)})" if known else "")
         self._fail(NodeEvent.SHUTDOWN, NodeShutdown(sentence))
 
-    def _clock_ahead_s(self, clock: int) -> float:
-        """Return by how much a CLOCK that the node has read before now is ahead of what it can be."""
+    def _clock_off(self, clock: int | None) -> str:
+        """Return how the node's clock is off, also by a CLOCK that the node has read before now, if it is."""
         if self._keeper is None or not self._keeper.estimator.ready:
-            return 0.0
-        return self._keeper.estimator.ahead_s(round(asyncio.get_running_loop().time() * 1e9), clock)
+            return ""
+        estimator, now_ns = self._keeper.estimator, round(asyncio.get_running_loop().time() * 1e9)
+        if jump_s := estimator.jumped_lately_s(now_ns):
+            return f"its clock has jumped by {jump_s * 1e3:+.1f} ms"
+        ahead_s = 0.0 if clock is None else estimator.ahead_s(now_ns, clock)
+        return f"its clock was {ahead_s * 1e3:.1f} ms ahead of what the host knows of it" if ahead_s else ""
 
     def _handle_starting(self, _: Message) -> None:
         if not self._starting_over:

@@ -22,8 +22,11 @@ OPEN = replace(CASES["sensor open"], bounds_s={"extruder": 1.5})
     "name",
     [
         "emergency stop, homing",
+        "node lost, printing",
         "node lost, homing",
         "host gone, homing",
+        "host stalls 2 s, printing",
+        "host's Python stalls 2 s, printing",
     ],
 )
 def test_heaters_are_off_in_time_and_motors_stand(name: str) -> None:

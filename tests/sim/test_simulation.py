@@ -36,17 +36,20 @@ def test_a_scenario_holds(entry: scenario.Scenario) -> None:
         ("clock_random", 526, "lost node toolhead: its clock is unusable: 8 readings in a row contradict"),
         (
             "clock_primary_jump",
-            9,
-            "Stepper too far in past (its clock was 949.7 ms ahead of what the host knows",
+            30,
+            "Stepper too far in past (its clock was 748.6 ms ahead of what the host knows",
         ),
+        ("clock_primary_jump", 40, "the clock of node mcu jumped by -753.8 ms during a move"),
+        ("clock_primary_jump", 359, "Stepper too far in past (its clock has jumped by +924.1 ms: its"),
         ("clock_primary_jump", 15, "the clock of node mcu jumped by +3.4 ms during a move"),
-        ("forged_block", 199, "node toolhead shut down: Another host sends to this node"),
+        ("forged_block", 184, "node toolhead shut down: Another host sends to this node"),
         ("cut_long", 981, "lost node toolhead: can0 node 5: lost, no acknowledgement"),
     ],
 )
 def test_what_a_seed_once_found(name: str, seed: int, cause: str) -> None:
-    """An axis followed a clock that lies, or late steps were named instead of it; commands of ours were lost
-    where a stranger's had met them; a long command of a slow axis was sent too late.
+    """An axis followed a clock that lies, late steps were named instead of it, or a jump was found only in the
+    next cycle; commands of ours were lost where a stranger's had met them; a long command of a slow axis was
+    sent too late.
     """
     result = play(scenario.find(name), seed)
     assert result.ok, result.to_text()
@@ -93,7 +96,7 @@ def nth_batch(
 
 
 def test_a_lost_batch_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    nth_batch(monkeypatch, 12, lambda _link, _batch, _send: None)
+    nth_batch(monkeypatch, 6, lambda _link, _batch, _send: None)
     assert rules(play(scenario.find("clean"), 1)) & {"missing", "band", "ending"}
 
 
@@ -102,7 +105,7 @@ def test_a_batch_sent_twice_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
         send(batch)
         send(batch)
 
-    nth_batch(monkeypatch, 12, twice)
+    nth_batch(monkeypatch, 6, twice)
     assert rules(play(scenario.find("clean"), 1)) & {"unplanned", "band", "ending"}
 
 

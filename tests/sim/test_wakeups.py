@@ -7,7 +7,7 @@ from coordinator.modules.heaters.sections import HeaterBed
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from coordinator.streaming.streamer import FULL_CYCLE_S, FULL_EARLY_S, REST_CYCLE_S
-from coordinator.streaming.worker import SEND_AHEAD_S
+from coordinator.streaming.worker import MAKE_AHEAD_S
 from nodes.devices.analog_in import REPORT_S
 from nodes.node.node import PATIENCE_S, REST_PATIENCE_S
 from tests.stages.printer import PRINTING, Printer, gcode
@@ -60,7 +60,7 @@ def test_nothing_is_polled(tmp_path: Path) -> None:
         await asyncio.sleep(6.0)
         lead_s, cycles = motion.lead.now_s, motion.streamer.cycles
         assert lead_s is not None
-        assert lead_s >= SEND_AHEAD_S - FULL_CYCLE_S - 0.01
+        assert lead_s >= MAKE_AHEAD_S - FULL_CYCLE_S - 0.01
         await asyncio.sleep(3.0)
         assert motion.streamer.cycles - cycles <= 3.0 / (FULL_CYCLE_S - FULL_EARLY_S) + 2
         await stage.until_job("done")

@@ -72,6 +72,7 @@ enum link_cause {
 struct link_settings {
     uint64_t receive_window; // bytes the node can buffer, >= LINK_WINDOW_MIN
     uint64_t lost_after_ns;  // time without an acknowledgement after which the link is lost; > 0
+    uint64_t ahead_ns;       // motion is sent so long before it is due at most; 0: as soon as it can be
 };
 
 struct link_stats {

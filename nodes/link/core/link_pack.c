@@ -25,24 +25,33 @@ static uint64_t free_at(const struct link *link, uint64_t min_clock) {
     return free_ns && free_ns < LINK_NEVER - GATE_MARGIN_NS ? free_ns + GATE_MARGIN_NS : free_ns;
 }
 
-static uint64_t gate_of(const struct link *link, const struct link_command *command) {
-    uint64_t reach = command->req_clock > CLOCK_REACH ? command->req_clock - CLOCK_REACH : 0;
-    if (!(link->clock_hz > 0))
-        return command->min_clock ? LINK_NEVER : 0;
-    uint64_t free_ns = free_at(link, command->min_clock);
-    uint64_t reach_ns = reach ? link_clock_to_ns(link, reach) : 0;
-    return free_ns > reach_ns ? free_ns : reach_ns;
+uint64_t link_near_at(const struct link *link, enum link_class kind, uint64_t req_clock) {
+    uint64_t near_ns = req_clock > CLOCK_REACH ? link_clock_to_ns(link, req_clock - CLOCK_REACH) : 0;
+    uint64_t ahead_ns = link->settings.ahead_ns, step_ns = ahead_ns / 2;
+    if (kind != LINK_MOTION || !step_ns || !req_clock)
+        return near_ns;
+    uint64_t due_ns = link_clock_to_ns(link, req_clock);
+    uint64_t steps = due_ns > ahead_ns ? (due_ns - ahead_ns + step_ns - 1) / step_ns : 0;
+    return steps * step_ns > near_ns ? steps * step_ns : near_ns;
 }
 
-static struct link_front ready(const struct link *link, const struct link_queue *queue, uint64_t now,
-                               size_t room) {
+static uint64_t gate_of(const struct link *link, enum link_class kind, uint64_t min_clock,
+                        uint64_t req_clock) {
+    if (!(link->clock_hz > 0))
+        return min_clock ? LINK_NEVER : 0;
+    uint64_t free_ns = free_at(link, min_clock), near_ns = link_near_at(link, kind, req_clock);
+    return free_ns > near_ns ? free_ns : near_ns;
+}
+
+static struct link_front ready(const struct link *link, enum link_class kind, uint64_t now, size_t room) {
+    const struct link_queue *queue = &link->queues[kind];
     struct link_front front = {.end = queue->head, .gate_ns = LINK_NEVER};
     while (front.end < queue->tail) {
         struct link_command command;
         uint64_t behind = link_queue_peek(queue, front.end, &command);
         if (command.size > room - front.size)
             break;
-        uint64_t gate_ns = gate_of(link, &command);
+        uint64_t gate_ns = gate_of(link, kind, command.min_clock, command.req_clock);
         if (gate_ns > now) {
             front.gate_ns = gate_ns;
             break;
@@ -63,7 +72,7 @@ static uint64_t filled_at(const struct link *link, const struct link_front *fron
         at = link_queue_peek(motion, at, &command);
         if (command.size > WIRE_CONTENT_MAX - size)
             break;
-        uint64_t gate_ns = gate_of(link, &command);
+        uint64_t gate_ns = gate_of(link, LINK_MOTION, command.min_clock, command.req_clock);
         if (gate_ns > latest)
             latest = gate_ns;
         size += command.size;
@@ -115,7 +124,7 @@ static void order_classes(const struct link *link, uint64_t now, unsigned allowe
             continue;
         struct link_command head;
         link_queue_peek(queue, queue->head, &head);
-        uint64_t gate_ns = gate_of(link, &head);
+        uint64_t gate_ns = gate_of(link, kind, head.min_clock, head.req_clock);
         if (gate_ns > now) {
             plan->at_ns = gate_ns < plan->at_ns ? gate_ns : plan->at_ns;
             continue;
@@ -157,7 +166,7 @@ static struct link_plan plan_allowed(const struct link *link, uint64_t now, unsi
     size_t filled = 0;
     for (size_t i = 0; i < plan.classes; i++) {
         enum link_class kind = plan.order[i];
-        plan.fronts[kind] = ready(link, &link->queues[kind], now, WIRE_CONTENT_MAX - plan.size);
+        plan.fronts[kind] = ready(link, kind, now, WIRE_CONTENT_MAX - plan.size);
         plan.size += plan.fronts[kind].size;
         filled += plan.fronts[kind].size > 0;
     }

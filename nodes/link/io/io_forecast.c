@@ -93,7 +93,9 @@ static void fill_bins(struct io_bus *bus, uint64_t now, struct bin *bins, struct
             if (!segment->req_clock || at >= BINS)
                 continue; // no deadline, or beyond the bins
             struct bin *bin = &bins[at];
-            uint64_t ready_ns = link_clock_to_ns(&node->link, segment->min_clock);
+            uint64_t free_ns = link_clock_to_ns(&node->link, segment->min_clock);
+            uint64_t near_ns = link_near_at(&node->link, LINK_MOTION, segment->req_clock);
+            uint64_t ready_ns = free_ns > near_ns ? free_ns : near_ns;
             bin->bits += bits;
             bin->ready_ns = !bin->due_ns || ready_ns < bin->ready_ns ? ready_ns : bin->ready_ns;
             bin->due_ns = !bin->due_ns || due_ns < bin->due_ns ? due_ns : bin->due_ns;

@@ -92,6 +92,9 @@ class Job:
     def release(self) -> None:
         self.told.append("release")
 
+    def call(self) -> None:
+        self.told.append("call")
+
 
 class Stage:
     def __init__(self, folder: Path) -> None:

@@ -160,7 +160,7 @@ class Bench:
     inbox: Inbox
 
     def open(self, nodeid: int, lost_after_s: float = 10.0) -> Link:
-        settings = LinkSettings(nodeid or None, lost_after_s=lost_after_s)
+        settings = LinkSettings(nodeid or None, lost_after_s=lost_after_s, ahead_s=0.0)
         return self.io.open_link(settings, on_responses=self.inbox.on_responses, on_lost=self.inbox.on_lost)
 
 

@@ -58,7 +58,9 @@ def test_node_ids_and_limits_at_the_edges_are_taken(nodeid: int) -> None:
     bus = Bus()
     settings = LinkSettings(nodeid, receive_window=64, lost_after_s=0.001)
     assert bus.open(settings).name == f"by hand node {nodeid}"
-    assert Bus(ByHand(serial=True)).open(LinkSettings(None, lost_after_s=3600)).name == "by hand"
+    assert (
+        Bus(ByHand(serial=True)).open(LinkSettings(None, lost_after_s=3600, ahead_s=3600)).name == "by hand"
+    )
     with pytest.raises(LinkError, match=f"node {nodeid}: there is a link with this id already, or 128 links"):
         bus.open(settings)
 
@@ -83,6 +85,8 @@ def test_node_ids_and_limits_at_the_edges_are_taken(nodeid: int) -> None:
         ),
         (False, LinkSettings(4, lost_after_s=0.0009), "lost_after_s=0.0009 is not within 0.001..3600 s"),
         (False, LinkSettings(4, lost_after_s=3600.5), "lost_after_s=3600.5 is not within 0.001..3600 s"),
+        (False, LinkSettings(4, ahead_s=-0.1), "ahead_s=-0.1 is not within 0..3600 s"),
+        (False, LinkSettings(4, ahead_s=3600.5), "ahead_s=3600.5 is not within 0..3600 s"),
     ],
 )
 def test_settings_that_cannot_be_are_refused_in_words(

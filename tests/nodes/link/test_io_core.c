@@ -48,7 +48,8 @@ static struct io_bus *bus_of(struct scene *scene, enum io_kind kind, const struc
 
 static void links_that_cannot_be_are_refused(void) {
     struct scene scene;
-    const struct link_settings narrow = {LINK_WINDOW_MIN - 1, 1}, never_lost = {192, 0};
+    const struct link_settings narrow = {.receive_window = LINK_WINDOW_MIN - 1, .lost_after_ns = 1},
+                               never_lost = {.receive_window = 192};
     uint32_t number = 0, other = 0;
     struct io_bus *bus = bus_of(&scene, IO_CAN_STREAM, &full_speed);
     CHECK_EQUAL(io_open_link(bus, 256, &usual, &number), IO_INVALID);

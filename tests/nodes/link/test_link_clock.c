@@ -139,6 +139,39 @@ static void a_clock_of_32_bits_has_to_reach(void) {
     check_waits_until(&scene, scene.now + 9 * TICK, "pp");
 }
 
+// In steps of half of the time ahead, never later than that before it is due.
+static void motion_does_not_go_too_far_ahead(void) {
+    static const struct {
+        uint64_t due, at_ns; // ticks after START, which is at one second
+    } cases[] = {
+        {3 * HZ, 2 * SECOND}, {3 * HZ + 1, 3 * SECOND}, {4 * HZ - 1, 3 * SECOND}, {4 * HZ, 3 * SECOND}};
+    struct scene scene;
+    for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
+        open_running(&scene, WINDOW);
+        scene.link.settings.ahead_ns = 2 * SECOND;
+        clock(&scene, HZ, scene.now, START);
+        motion(&scene, 'm', 2, 0, START + cases[i].due);
+        check_waits_until(&scene, cases[i].at_ns, "mm");
+    }
+    open_running(&scene, WINDOW);
+    scene.link.settings.ahead_ns = 2 * SECOND;
+    clock(&scene, HZ, scene.now, START);
+    motion(&scene, 'n', 2, 0, START + 2 * HZ); // near enough
+    check_goes(&scene, "nn");
+    motion(&scene, 'o', 2, 0, 0); // at any time
+    check_goes(&scene, "oo");
+    acknowledge_all(&scene);
+    motion(&scene, 'p', 2, START + 3 * HZ, START + 3 * HZ); // there is no room before
+    check_waits_until(&scene, 4 * SECOND + 2 * MS, "pp");
+    acknowledge_all(&scene);
+    CHECK_EQUAL(try_send(&scene, LINK_CONTROL, 'c', 2, 0, START + 99 * HZ), LINK_OK); // as far as it likes
+    check_goes(&scene, "cc");
+    acknowledge_all(&scene);
+    motion(&scene, 'q', 2, 0, UINT64_MAX);
+    CHECK_EQUAL(go(&scene), 0);
+    CHECK(deadline_of(&scene) > UINT64_MAX / 2);
+}
+
 // What is due within reach is not held back, even by a clock that has not begun.
 static void a_clock_that_has_not_begun_holds_nothing_back(void) {
     struct scene scene;
@@ -213,6 +246,7 @@ int main(void) {
     a_command_waits_for_its_min_clock();
     the_earliest_of_all_classes_wakes();
     a_clock_of_32_bits_has_to_reach();
+    motion_does_not_go_too_far_ahead();
     a_clock_that_has_not_begun_holds_nothing_back();
     without_a_clock_only_what_needs_one_waits();
     the_end_of_time_is_not_passed();

@@ -18,6 +18,7 @@ from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, store
 
 KINDS = list(TransportKind)
 LEAD_S = 600
+"""Of motion that is sent as soon as it can be."""
 """How far ahead of its time motion is queued; longer than a busy computer can stand still."""
 CAN_KINDS = [TransportKind.CAN_STREAM, TransportKind.CAN_PACKET]
 

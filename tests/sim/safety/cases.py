@@ -26,6 +26,11 @@ STEPS_S: Final = 0.02
 """Within this nothing moves any more after an emergency stop: commands of the stop, over the bus."""
 LEFT_ALONE_S: Final = 1.25
 """Steps are sent 1.2 s ahead: so long a machine may go on that loses its host."""
+PYTHON_STALLS_S: Final = 1.55
+"""Steps are made 1.5 s ahead, and sent by threads that need no Python."""
+NODE_LOST_S: Final = 1.75
+"""So long the other nodes may go on after one is cut off: motion is sent every 0.6 s, and the host waits a
+second for an acknowledgement, and then for an answer."""
 HOLD: Final = ("M140 S110", "M104 S200", "TEMPERATURE_WAIT SENSOR=extruder MINIMUM=197", "M118 hot")
 """The bed is still heated when the hotend holds."""
 
@@ -130,7 +135,13 @@ def cases() -> list[Case]:
             bounds_s={"extruder": STOP_S},
         ),
         broken("node lost, heating", cause=_cut, bounds_s=LOST, told="lost node toolhead"),
-        moving("node lost, printing", cause=_cut, bounds_s=LOST, told="lost node toolhead"),
+        moving(
+            "node lost, printing",
+            cause=_cut,
+            bounds_s=LOST,
+            told="lost node toolhead",
+            steps_s=NODE_LOST_S,
+        ),
         moving(
             "node lost, homing",
             lines=HOME,
@@ -142,6 +153,12 @@ def cases() -> list[Case]:
         broken("host stalls 2 s", cause=lambda rig: rig.stall(2.0), told="shut down"),
         broken("host's Python stalls 2 s", cause=lambda rig: rig.stall(2.0, io=False), told="shut down"),
         moving("host stalls 2 s, printing", cause=lambda rig: rig.stall(2.0), told="shut down"),
+        moving(
+            "host's Python stalls 2 s, printing",
+            cause=lambda rig: rig.stall(2.0, io=False),
+            told="shut down",
+            steps_s=PYTHON_STALLS_S,
+        ),
         broken("host gone", cause=lambda rig: rig.stall(30.0), told="shut down"),
         moving(
             "host gone, homing",
