@@ -47,9 +47,8 @@ def test_a_scenario_holds(entry: scenario.Scenario) -> None:
     ],
 )
 def test_what_a_seed_once_found(name: str, seed: int, cause: str) -> None:
-    """An axis followed a clock that lies, late steps were named instead of it, or a jump was found only in the
-    next cycle; commands of ours were lost where a stranger's had met them; a long command of a slow axis was
-    sent too late.
+    """An axis followed a clock that lies; late steps were named instead of it; a jump was found a cycle late;
+    commands of ours were lost where a stranger's had met them; a long command of a slow axis was late.
     """
     result = play(scenario.find(name), seed)
     assert result.ok, result.to_text()
