@@ -129,8 +129,8 @@ class LinkSettings:
     lost_after_s: float = 1.0
     """Time without an acknowledgement after which the link is lost."""
     ahead_s: float = 1.2
-    """Motion is sent so long before it is due at most, half of that at least: a node goes on for so long when
-    its host is gone. 0: it is sent as soon as the node has room for it."""
+    """Motion is sent so long before it is due at most, three quarters of that at least: a node goes on for so
+    long when its host is gone. 0: it is sent as soon as the node has room for it."""
 
 
 @dataclass(frozen=True, slots=True)

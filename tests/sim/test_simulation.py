@@ -36,13 +36,12 @@ def test_a_scenario_holds(entry: scenario.Scenario) -> None:
         ("clock_random", 526, "lost node toolhead: its clock is unusable: 8 readings in a row contradict"),
         (
             "clock_primary_jump",
-            30,
-            "Stepper too far in past (its clock was 748.6 ms ahead of what the host knows",
+            93,
+            "Stepper too far in past (its clock was 875.2 ms ahead of what the host knows",
         ),
         ("clock_primary_jump", 40, "the clock of node mcu jumped by -753.8 ms during a move"),
-        ("clock_primary_jump", 359, "Stepper too far in past (its clock has jumped by +924.1 ms: its"),
         ("clock_primary_jump", 15, "the clock of node mcu jumped by +3.4 ms during a move"),
-        ("forged_block", 184, "node toolhead shut down: Another host sends to this node"),
+        ("forged_block", 295, "node toolhead shut down: Another host sends to this node"),
         ("cut_long", 981, "lost node toolhead: can0 node 5: lost, no acknowledgement"),
     ],
 )

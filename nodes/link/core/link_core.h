@@ -54,8 +54,8 @@ static inline int link_fits(const struct link *link, size_t bytes) {
     return link->in_flight_bytes == 0 || unread + bytes <= link->settings.receive_window;
 }
 
-// Returns from when on a command that is due at REQ_CLOCK is not too far ahead. Motion: in steps of half of
-// that time, so that a thread that wakes for some of it sends much at once. The clock must be known.
+// Returns from when on a command that is due at REQ_CLOCK is not too far ahead. Motion: in steps of a quarter
+// of that time, so that a thread that wakes for some of it sends much at once. The clock must be known.
 uint64_t link_near_at(const struct link *link, enum link_class kind, uint64_t req_clock);
 
 // The records at the front of a queue that may be sent now and fit together.

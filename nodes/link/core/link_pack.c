@@ -27,7 +27,7 @@ static uint64_t free_at(const struct link *link, uint64_t min_clock) {
 
 uint64_t link_near_at(const struct link *link, enum link_class kind, uint64_t req_clock) {
     uint64_t near_ns = req_clock > CLOCK_REACH ? link_clock_to_ns(link, req_clock - CLOCK_REACH) : 0;
-    uint64_t ahead_ns = link->settings.ahead_ns, step_ns = ahead_ns / 2;
+    uint64_t ahead_ns = link->settings.ahead_ns, step_ns = ahead_ns / 4;
     if (kind != LINK_MOTION || !step_ns || !req_clock)
         return near_ns;
     uint64_t due_ns = link_clock_to_ns(link, req_clock);

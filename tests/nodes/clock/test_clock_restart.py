@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from nodes.clock.clock import CONTRADICTIONS, GAP_NS, ClockEstimator, HostTime
+from nodes.clock.clock import CONTRADICTIONS, GAP_NS, LATELY_NS, ClockEstimator, HostTime
 from nodes.clock.start import START_SAMPLES
 
 FREQ_HZ = 168_000_000
@@ -99,9 +99,13 @@ def test_a_jump_is_told_from_a_clock_that_begins_again_close_by(
     settled.zero_ns -= round(moved_s * 1e9)
     for _ in range(CONTRADICTIONS - 1):
         settled.sample(used=False)
+    found_ns = settled.now_ns
     settled.sample()
     assert settled.estimator.jumps == jumps
-    assert settled.estimator.jump_s == pytest.approx(moved_s * jumps, abs=TOLERANCE_S)
+    jump_s = settled.estimator.jump_s
+    assert jump_s == pytest.approx(moved_s * jumps, abs=TOLERANCE_S)
+    assert settled.estimator.jumped_lately_s(found_ns + LATELY_NS) == jump_s
+    assert settled.estimator.jumped_lately_s(found_ns + LATELY_NS + SECOND_NS) == 0
 
 
 def test_an_estimate_that_was_off_within_the_time_of_its_answers_is_no_jump() -> None:

@@ -28,8 +28,8 @@ LEFT_ALONE_S: Final = 1.25
 """Steps are sent 1.2 s ahead: so long a machine may go on that loses its host."""
 PYTHON_STALLS_S: Final = 1.55
 """Steps are made 1.5 s ahead, and sent by threads that need no Python."""
-NODE_LOST_S: Final = 1.75
-"""So long the other nodes may go on after one is cut off: motion is sent every 0.6 s, and the host waits a
+NODE_LOST_S: Final = 1.5
+"""So long the other nodes may go on after one is cut off: motion is sent every 0.3 s, and the host waits a
 second for an acknowledgement, and then for an answer."""
 HOLD: Final = ("M140 S110", "M104 S200", "TEMPERATURE_WAIT SENSOR=extruder MINIMUM=197", "M118 hot")
 """The bed is still heated when the hotend holds."""
