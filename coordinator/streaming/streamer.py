@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Notice, StandstillAction
+from coordinator.runtime.bus_overload import BusOverload
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
 from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import MoveSource, Planned, ProgramOutput, Witness
@@ -168,7 +169,9 @@ class Streamer:
     async def _stop_after(self, error: BaseException | None, watch: asyncio.Future[MachineStopped]) -> None:
         """Stop the machine after ERROR of the stream."""
         # The link may have failed a moment before its node is known to be lost: that is the better cause.
-        await asyncio.wait((watch,), timeout=CAUSE_WAIT_S)
+        # Meanwhile a bus that carries too little would make the first step late.
+        if not isinstance(error, BusOverload):
+            await asyncio.wait((watch,), timeout=CAUSE_WAIT_S)
         self._machine.stop(f"{error}; all nodes were stopped")
         await watch
 
