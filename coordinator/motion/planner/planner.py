@@ -240,7 +240,7 @@ class Planner:
     # ---- Where things are ----
 
     def state(self) -> PlannerState:
-        """Return all that programs are told of, at once."""
+        """Return what programs can read of the planner, as it is now."""
         core, state, limits = self._core, self._state, self._core.limits
         return PlannerState(
             toolhead_position=self.toolhead_position,

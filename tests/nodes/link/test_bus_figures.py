@@ -75,6 +75,17 @@ def test_a_known_bit_rate_gives_figures_and_forecasts() -> None:
         io.forecast()
 
 
+@pytest.mark.parametrize("after_ns", [5_000_000_000, 6_123_456_789])
+def test_motion_is_not_sent_further_ahead_than_a_node_may_go_on_alone(after_ns: int) -> None:
+    scene, node = Bus(), NodeTwin()
+    link = scene.open(4)
+    link.set_clock(1e9, START_NS, START_NS)
+    link.send_batch(record(store(1, 8), START_NS + after_ns))
+    scene.driver.exchange({4: node}, lambda: bool(node.executed))
+    ahead_ns = LinkSettings(4).ahead_s * 1e9
+    assert 0.75 * ahead_ns - 1e6 < START_NS + after_ns - scene.driver.now < ahead_ns
+
+
 def test_blocks_of_one_link_share_frames() -> None:
     scene, node = Bus(), NodeTwin()
     link = scene.open(4)

@@ -23,7 +23,7 @@ def test_a_link_that_did_nothing_has_counted_nothing() -> None:
 
 
 def test_defaults_are_those_of_the_documentation() -> None:
-    assert LinkSettings(4) == LinkSettings(4, receive_window=192, lost_after_s=1.0)
+    assert LinkSettings(4) == LinkSettings(4, receive_window=192, lost_after_s=1.0, ahead_s=1.2)
     assert BusSettings().as_dict() == {"bitrate": 0, "ceiling": 0.9, "queue_frames": 0}
 
 
