@@ -11,16 +11,18 @@ import base64
 import binascii
 import re
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Final
 
 HEAD_BYTES: Final = 1_048_576
 """Of a program: where pictures are looked for."""
 PNG_BYTES_MAX: Final = 131_072
 """Of one picture; larger ones are left out."""
-_BEGIN: Final = re.compile(
-    rb"^;[ \t]*thumbnail begin[ \t]+(\d{1,4})[x ](\d{1,4})[ \t]+\d{1,9}[ \t]*\r?$", re.MULTILINE
-)
-_END: Final = re.compile(rb"^;[ \t]*thumbnail end", re.MULTILINE)
+_COMMENT_BYTES_MAX: Final = 2 * PNG_BYTES_MAX
+_MARK_BYTES_MAX: Final = 256
+"""Of a line at which a picture begins or ends."""
+_BEGIN: Final = re.compile(rb";[ \t]*thumbnail begin[ \t]+(\d{1,4})[x ](\d{1,4})[ \t]+\d{1,9}\s*")
+_END: Final = re.compile(rb";[ \t]*thumbnail end")
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 
 
@@ -35,25 +37,33 @@ class Thumbnail:
 
 
 def thumbnails(head: bytes) -> list[Thumbnail]:
-    """Return the pictures in HEAD, a program's first HEAD_BYTES bytes, the smallest first."""
+    """Return the pictures in HEAD, a program's first HEAD_BYTES bytes, the smallest first.
+
+    Each line is looked at once, and no step of it takes long: a thread may do it beside the control loop.
+    """
     found = []
-    for begin in _BEGIN.finditer(head):
-        end = _END.search(head, begin.end())
-        if end is None:
-            break
-        png = _decoded(head[begin.end() : end.start()])
-        if png is not None:
-            found.append(Thumbnail(int(begin[1]), int(begin[2]), png))
+    begin: re.Match[bytes] | None = None
+    comments = bytearray()
+    for line in BytesIO(head):
+        is_mark = line.startswith(b";") and len(line) <= _MARK_BYTES_MAX
+        if is_mark and (another := _BEGIN.fullmatch(line)):
+            begin = another
+            comments.clear()
+        elif begin is not None and is_mark and _END.match(line):
+            if png := _decoded(bytes(comments)):
+                found.append(Thumbnail(int(begin[1]), int(begin[2]), png))
+            begin = None
+        elif begin is not None and len(comments) <= _COMMENT_BYTES_MAX:
+            comments += line.strip().lstrip(b";").strip()
     return sorted(found, key=lambda picture: picture.width * picture.height)
 
 
-def _decoded(comments: bytes) -> bytes | None:
-    """Return the PNG that COMMENTS hold in base64, or None."""
-    if len(comments) > 2 * PNG_BYTES_MAX:
+def _decoded(text: bytes) -> bytes | None:
+    """Return the PNG that TEXT is in base64, or None."""
+    if len(text) > _COMMENT_BYTES_MAX:
         return None
-    lines = (line.strip().lstrip(b";").strip() for line in comments.splitlines())
     try:
-        png = base64.b64decode(b"".join(lines), validate=True)
+        png = base64.b64decode(text, validate=True)
     except binascii.Error:
         return None
     return png if png.startswith(_PNG) and len(png) <= PNG_BYTES_MAX else None

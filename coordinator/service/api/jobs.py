@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from coordinator.gcode.commands import Recovering
-from coordinator.gcode.thumbnail import HEAD_BYTES, thumbnails
+from coordinator.gcode.thumbnail import HEAD_BYTES, Thumbnail, thumbnails
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.motion import MotionOver
@@ -38,6 +38,8 @@ class _Jobs:
 
     def __init__(self, service: MachineService) -> None:
         self._service = service
+        self._one_picture = asyncio.Lock()
+        """Held while a thread searches a file for pictures: it shares Python with the control loop."""
 
     async def list(self, _caller: Caller, params: dict[str, Any]) -> Value:
         folder, first = self._folder(), params["first"]
@@ -112,10 +114,11 @@ class _Jobs:
     async def thumbnail(self, _caller: Caller, params: dict[str, Any]) -> Value:
         folder, most = self._folder(), params["pixels_max"]
         try:
-            head = await asyncio.to_thread(folder.head, params["file"], HEAD_BYTES)
+            async with self._one_picture:
+                pictures = await asyncio.to_thread(_pictures, folder, params["file"])
         except NoSuchJob as error:
             raise ApiError("no_such_file", str(error)) from None
-        fitting = [picture for picture in thumbnails(head) if max(picture.width, picture.height) <= most]
+        fitting = [picture for picture in pictures if max(picture.width, picture.height) <= most]
         if not fitting:
             return {"width": None, "height": None, "png": None}
         best = fitting[-1]
@@ -143,6 +146,11 @@ class _Jobs:
     def _status(self) -> Value:
         self._service.look()
         return job_figures(self._service.job, self._service.now_s)
+
+
+def _pictures(folder: JobFolder, name: str) -> list[Thumbnail]:
+    """Return the pictures in the file NAME of FOLDER; raises NoSuchJob."""
+    return thumbnails(folder.head(name, HEAD_BYTES))
 
 
 def _name(name: str) -> str:

@@ -4,7 +4,7 @@ from base64 import b64encode
 
 import pytest
 
-from coordinator.gcode.thumbnail import PNG_BYTES_MAX, Thumbnail, thumbnails
+from coordinator.gcode.thumbnail import HEAD_BYTES, PNG_BYTES_MAX, Thumbnail, thumbnails
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -37,3 +37,16 @@ def test_all_pictures_are_found_the_smallest_first() -> None:
 )
 def test_anything_else_is_no_picture(text: str) -> None:
     assert thumbnails(text.encode()) == []
+
+
+def test_a_begin_without_end_starts_afresh() -> None:
+    text = comments(PNG + b"a", "300x200", end="") + comments(PNG + b"b", "16x16")
+    assert thumbnails(text.encode()) == [Thumbnail(16, 16, PNG + b"b")]
+
+
+def test_pictures_that_begin_again_and_again_are_read_once() -> None:
+    """Failed before: each begin was searched to the end, a minute for a file's head."""
+    begin = b"; thumbnail begin 300x300 100\n"
+    picture = comments(PNG).encode()
+    repeated = begin * ((HEAD_BYTES - len(picture)) // len(begin))
+    assert thumbnails(repeated + picture) == [Thumbnail(32, 32, PNG)]
