@@ -9,9 +9,10 @@ from coordinator.ipc.server.uploads import _check_name
 from coordinator.service.jobs.job_folder import JobFolder, NoSuchJob
 from coordinator.support.job_names import NAME_BYTES_MAX, is_job_name, job_path_parts
 
-GOOD = ("a.gcode", "part (2) – ü.GCODE", "x.nc", "é" * 117 + ".gcode", "a..gcode")  # noqa: RUF001
+GOOD = ("a.gcode", "part (2) – ü.GCODE", "x.nc", "é" * 117 + ".gcode", "a..gcode", "a*b.gcode")  # noqa: RUF001
 BAD = ("", ".gcode", ".a.gcode", "-a.gcode", " a.gcode", "a", "a.txt", "a\\b.gcode", "a\x1b.gcode",
-       "a\n.gcode", "a\u202e.gcode", "é" * 118 + ".gcode", "\ud800.gcode", "a\x7f.gcode")  # fmt: skip
+       "a\n.gcode", "a\u202e.gcode", "é" * 118 + ".gcode", "\ud800.gcode", "a\x7f.gcode",
+       "a;b.gcode")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", GOOD)
@@ -35,3 +36,10 @@ def test_bad_names_go_no_way(tmp_path: Path, name: str) -> None:
         _check_name(name)
     with pytest.raises(NoSuchJob):
         JobFolder(tmp_path).open(name)
+
+
+@pytest.mark.parametrize("path", ["./a.gcode", "a.gcode/", "/a.gcode", "sub//a.gcode", "sub/./a.gcode"])
+def test_a_path_has_one_spelling(path: str) -> None:
+    """Failed before: job.start took what job.upload refused."""
+    assert not job_path_parts(path)
+    assert job_path_parts("sub/a.gcode") == ("sub", "a.gcode")

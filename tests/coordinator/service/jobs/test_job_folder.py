@@ -33,7 +33,7 @@ def test_lists_jobs_by_name_and_nothing_else(folder: JobFolder) -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["a.gcode", "parts/small/b.NC", "./a.gcode", "parts//small/b.NC"])
+@pytest.mark.parametrize("name", ["a.gcode", "parts/small/b.NC"])
 def test_opens_a_job(folder: JobFolder, name: str) -> None:
     with folder.open(name) as program:
         assert program.refill()
@@ -46,6 +46,8 @@ def test_opens_a_job(folder: JobFolder, name: str) -> None:
     [
         "",
         ".",
+        "./a.gcode",
+        "parts//small/b.NC",
         "..",
         "../secret.gcode",
         "parts/../../secret.gcode",
