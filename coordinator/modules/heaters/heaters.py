@@ -163,7 +163,7 @@ class HeaterRegistry(Module):
         high = value(command, given, "MAXIMUM", float("inf"))
         if low > high:
             raise WordError(f"TEMPERATURE_WAIT: MINIMUM={low:g} is above MAXIMUM={high:g}")
-        if low > source.max_c or high < source.min_c:
+        if low >= source.max_c or high <= source.min_c:
             raise WordError(
                 f"TEMPERATURE_WAIT waits for what [{source.name}] never reads: it takes"
                 f" {source.min_c:g} to {source.max_c:g} °C"
