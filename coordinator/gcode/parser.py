@@ -13,10 +13,14 @@ _CODE = re.compile(r"([GMTgmt])(\d{1,9})(\.\d{1,9})?(?![\d_.])", re.ASCII)
 _NAME = re.compile(r"[A-Za-z_]\w*(?=[ \t;]|$)", re.ASCII)
 _BARE_WORD = re.compile(r"[XYZEFxyzef][+-]?\.?\d", re.ASCII)
 _LINE_NUMBER = re.compile(rb"[Nn]\d+[ \t]*")
-_CHECKSUM = re.compile(rb"\*[ \t]*(\S*)[ \t]*$")
 _WORD = re.compile(r"\s*([A-Za-z])([+-]?(?:\d+\.?\d*|\.\d+)|(?=\s|$))\s*", re.ASCII)
 _PARAMETER = re.compile(r"\s*([A-Za-z_]\w*)=(\"[^\"]*\"|'[^']*'|\S*)(?:\s+|$)", re.ASCII)
+_UNCOMMENTED = re.compile(r"(?:=\"[^\"]*\"|='[^']*'|[^;])*")
+"""Parameters: a semicolon in the quotes of a value begins no comment."""
 _PLAIN = re.compile(r"[\w.+-]+", re.ASCII)
+_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+_TEXTS = frozenset({"23", "117", "118"})
+"""M-codes that a text follows."""
 _QUOTED_MAX = 40
 _LINE_MAX = 4096
 
@@ -42,7 +46,7 @@ class Command:
 
     def only_words(self, known: str) -> dict[str, str]:
         """Read the parameters as letters with numbers; what is none of KNOWN is ignored."""
-        return self._only(self.words(), known)
+        return self._only(self.words(known), known)
 
     def only_parameters(self, known: Iterable[str]) -> dict[str, str]:
         """Read the parameters as NAME=VALUE; what is none of KNOWN is ignored."""
@@ -54,10 +58,14 @@ class Command:
                 self.taken[key] = self.taken.get(key, False) or key in known
         return {key: text for key, text in found.items() if key in known}
 
-    def words(self) -> dict[str, str]:
-        """Read the parameters as letters with numbers (or without: ``G28 X``)."""
+    def words(self, known: str = _LETTERS) -> dict[str, str]:
+        """Read the parameters as letters with numbers (or without: ``G28 X``).
+
+        Words may follow each other without blanks (``G1X1E2``), but only those of KNOWN: else ``S1e9`` and
+        ``S0x5`` would be S1 and S0.
+        """
         words: dict[str, str] = {}
-        at = 0
+        at = began = 0
         while at < len(self.text):
             match = _WORD.match(self.text, at)
             if not match:
@@ -67,8 +75,10 @@ class Command:
             letter = match[1].upper()
             if letter in words:
                 raise WordError(f"{self.name} has {letter} twice; leave one")
+            if letter not in known and at and not self.text[at - 1].isspace():
+                raise _no_number(self.name, self.text[began], self.text[began + 1 :].split()[0])
             words[letter] = match[2]
-            at = match.end()
+            began, at = at, match.end()
         return words
 
     def parameters(self) -> dict[str, str]:
@@ -118,8 +128,12 @@ def number(what: str, words: Mapping[str, str], key: str) -> float:
         raise WordError(f"{key} of {what} has no number; write {key} and a decimal number")
     value = read_decimal(text)
     if value is None:
-        raise WordError(f"{key} of {what} is {quoted(text)}, which is not a number, or is out of range")
+        raise _no_number(what, key, text)
     return value
+
+
+def _no_number(what: str, key: str, text: str) -> WordError:
+    return WordError(f"{key} of {what} is {quoted(text)}, which is not a number, or is out of range")
 
 
 @lru_cache(maxsize=256)  # slicers repeat few different lines, thousands of times
@@ -137,16 +151,17 @@ def parse(line: bytes) -> Command | None:
         fraction = (match[3] or "").rstrip("0").rstrip(".")
         rest = text[match.end() :]
         name, written = match[1].upper() + str(int(match[2])) + fraction, match[0].upper()
-        # Display texts (M117, M118) are not words and may hold anything.
+        # Display texts (M117, M118) and the name of a file (M23) are not words and may hold parentheses.
         return Command(
             name,
-            rest if match[1] in "Mm" and match[2] in {"117", "118"} else _without_comments(rest).strip(),
+            rest if match[1] in "Mm" and match[2] in _TEXTS else _without_comments(rest).strip(),
             written if written != name else "",
         )
     if _BARE_WORD.match(text):
         raise WordError(f"{quoted(text)} has no command; write G0 or G1 before the axes")
     if match := _NAME.match(text):
-        return Command(match[0].upper(), text[match.end() :].split(";")[0].strip())
+        parameters = _UNCOMMENTED.match(text, match.end())
+        return Command(match[0].upper(), parameters[0].strip() if parameters else "")
     raise WordError(f"cannot read {quoted(text)}; it is neither a G-code command nor a comment")
 
 
@@ -168,16 +183,21 @@ def _without_comments(text: str) -> str:
 
 
 def _without_frame(line: bytes) -> bytes:
-    """Strip the line number and check the checksum, if any."""
+    """Strip the line number and check the checksum, if any.
+
+    A star in a line without a number begins a checksum only where digits follow: it may stand in a text.
+    """
     numbered = _LINE_NUMBER.match(line)
     code = line.split(b";")[0]
     is_code = numbered or (line[:1] in b"GMTgmt" and line[1:2].isdigit())
-    if is_code and (star := _CHECKSUM.search(code)):
-        expected = reduce(xor, code[: star.start()], 0)
-        given = star[1].decode("ascii", "replace")
-        if given != str(expected):
+    counted, star, sum_ = code.rpartition(b"*")
+    given = sum_.strip(b" \t")
+    if is_code and star and (given.isdigit() or numbered):
+        expected = reduce(xor, counted, 0)
+        if given != b"%d" % expected:
+            text = quoted(given.decode("ascii", "replace"))
             raise WordError(
-                f"the checksum is {quoted(given)}, but the line adds up to {expected}; copy the file again"
+                f"the checksum is {text}, but the line adds up to {expected}; copy the file again"
             )
-        line = code[: star.start()]
+        line = counted
     return line[numbered.end() :] if numbered else line

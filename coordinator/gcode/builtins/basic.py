@@ -28,7 +28,7 @@ def _positive(command: Command, words: Mapping[str, float]) -> None:
 
 def _move(job: ProgramContext, command: Command) -> bool:
     """G0, G1 that the hot path refused: unusual words, or numbers of many digits."""
-    words = command.words()
+    words = command.words(MOVE_LETTERS)
     for letter in words.keys() - set(MOVE_LETTERS):
         job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
     values = {letter: number(command.name, words, letter) for letter in words if letter in MOVE_LETTERS}
@@ -215,7 +215,7 @@ def _arc(job: ProgramContext, command: Command) -> bool:
     """G2, G3 that the hot path refused: unusual words, an impossible arc."""
     planner = job.planner
     if not planner.arc_open:
-        words = command.words()
+        words = command.words(ARC_LETTERS)
         for letter in words.keys() - set(ARC_LETTERS):
             job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
         values = {letter: number(command.name, words, letter) for letter in words if letter in ARC_LETTERS}
@@ -237,7 +237,7 @@ def _heat(job: ProgramContext, command: Command) -> bool:
     why = job.vocabulary.unsupported.get(command.name)
     if why is None:
         return _without_heater(job, command)
-    words = command.words()
+    words = command.words("SRT")
     asks = [letter for letter in "SR" if letter in words and number(command.name, words, letter) > 0]
     if command.name in _HEATS and asks:
         job.refuse_skipping(command, f"heats, but {why}")

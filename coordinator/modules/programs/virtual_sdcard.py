@@ -120,7 +120,7 @@ class VirtualSdcard(Module):
         return Immediate(("SD card ok",), kind=ReplyKind.PLAIN)
 
     def _select(self, call: Call) -> Reading:
-        name = call.command.text.strip().lstrip("/")
+        name = call.command.text.split(";")[0].strip().lstrip("/")
         if not name:
             raise WordError("M23 names no file; write M23 and its name")
         self._check(name)
@@ -150,7 +150,7 @@ class VirtualSdcard(Module):
         return ProgramAction(act)
 
     def _seek(self, call: Call) -> Reading:
-        if call.command.words().get("S", "0") not in {"", "0"}:
+        if call.command.words("S").get("S", "0") not in {"", "0"}:
             raise WordError(
                 "M26 cannot begin in the middle of a file: temperatures, modes and origin would be missing;"
                 " RESUME_INTERRUPTED goes on with one"

@@ -50,7 +50,7 @@ class DisplayStatus(Module):
         return Immediate(act=act)
 
     def _set_progress(self, call: Call) -> Reading:
-        words = call.command.words()
+        words = call.command.words("PQRS")
         if "P" not in words:
             return Immediate()  # R alone: the minutes that are left
         percent = number("M73", words, "P")

@@ -315,6 +315,8 @@ def test_numbers_of_many_digits_go_the_slow_way() -> None:
         ("G1 X1.2.3", "G1 has '.3' where a letter and a number belong"),
         ("G1 X1 (open", "the comment '(open' does not end"),
         ("G1 X" + "9" * 400, "out of range"),
+        ("G1 X1d3", "X of G1 is '1d3', which is not a number"),
+        ("G2 X1d3 I1", "X of G2 is '1d3', which is not a number"),
         ("G1 X1*5", "the checksum is '5', but the line adds up to"),
         ("X10 Y10", "has no command; write G0 or G1"),
         ("\x00\x01\x02", "cannot read"),
