@@ -138,3 +138,17 @@ def test_an_emergency_of_a_macro_and_a_macro_that_does_not_end(tmp_path: Path) -
         await stage.until_state("shutdown")
 
     machine.serve(go)
+
+
+def test_a_wait_for_less_than_the_room_has_ends(tmp_path: Path) -> None:
+    """Failed before: M190 S5 waited for ever."""
+    machine = DemoMachine(tmp_path)
+
+    async def go(stage: Served) -> None:
+        with pytest.raises(
+            ApiError, match=r"\[heater_bed\] stays at 2\d\.\d °C without power, above its target of 5 °C"
+        ):
+            await run(stage, "M190 S5")
+        assert (await stage.call("machine.state"))["state"] == "ready"
+
+    machine.serve(go)

@@ -6,7 +6,9 @@ The host renews the output with every measurement and with nothing else: no meas
 them it ends the heat a moment before the node would have to stop, since the node may have other tasks.
 """
 
+import asyncio
 import contextlib
+import math
 from collections.abc import Callable, Mapping
 from typing import Final, Protocol
 
@@ -45,6 +47,10 @@ STALE_EARLY_S: Final = 0.3
 """So much earlier that is checked when the computer is awake anyway, as for measurements."""
 STALE_AGAIN_S: Final = 0.01
 """Least time until the next check of that."""
+
+COOLS_WITHIN_S: Final = 300.0
+COOLS_BY_C: Final = 0.2
+"""A heater without power that gets no cooler than this in that time is as warm as the room."""
 
 COMING_S: Final = 1.0
 """How far ahead filament that is going to pass is taken into account, from when a power acts."""
@@ -206,9 +212,22 @@ class Heater:
         return self.input.is_sound and self.controller.settled(self.input.celsius, self.target_c)
 
     async def reach(self) -> None:
-        """Wait until the target is reached; raises CanductorError when the heater ends before."""
+        """Wait until the target is reached; raises CanductorError when the heater ends before.
+
+        So it does when nothing cools it down to its target.
+        """
         await self._next()  # with the target in force
+        loop = asyncio.get_running_loop()
+        coolest_c, since_s = math.inf, loop.time()
         while not self.settled:
+            celsius = self.input.celsius or 0.0
+            if celsius <= self.target_c or self.power > 0 or celsius < coolest_c - COOLS_BY_C:
+                coolest_c, since_s = celsius, loop.time()
+            elif loop.time() - since_s > COOLS_WITHIN_S:
+                raise CanductorError(
+                    f"[{self.name}] stays at {celsius:.1f} °C without power, above its target of"
+                    f" {self.target_c:g} °C: nothing cools it further; use a target above that of the room"
+                )
             await self._next()
 
     async def _next(self) -> None:
