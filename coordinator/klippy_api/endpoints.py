@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
+from coordinator.gcode.script_lines import script_lines
 from coordinator.klippy_api.client import DUMPS_MAX, REMOTE_METHODS_MAX, Client
 from coordinator.klippy_api.move_dump import HEADER as MOVE_HEADER
 from coordinator.klippy_api.move_dump import TOOLHEAD, MoveDump
@@ -34,7 +35,10 @@ Endpoint = Callable[[Client, Request], Result | Awaitable[Result]]
 APP: Final = "canductor"
 WHO: Final = "a client of the Klippy API"
 MESH_ARGUMENTS_MAX: Final = 32
-_EMERGENCY: Final = re.compile(r"^\s*(?:N\d+\s*)?M112\b", re.IGNORECASE | re.MULTILINE)
+_EMERGENCY: Final = re.compile(
+    r"(?:^|(?<=\r))[ \t]*(?:N\d+[ \t]*)?M112\b", re.ASCII | re.IGNORECASE | re.MULTILINE
+)
+"""Within one line: a search looks at each line once, however many there are."""
 _ROOT: Final = Path(__file__).parent.parent.parent
 
 
@@ -190,7 +194,7 @@ class Endpoints:
 
     async def _lines(self, script: str) -> Result:
         """Run SCRIPT; errors also go to all who listen to g-code."""
-        lines = [line for line in script.splitlines() if line.strip()]
+        lines = [line for line in script_lines(script) if line.strip()]
         try:
             for first in range(0, len(lines), LINES_MAX):
                 await run_lines(self._service, lines[first : first + LINES_MAX], self._say)

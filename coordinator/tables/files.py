@@ -19,7 +19,7 @@ ANGLES: Final = {"deg": 1.0, "arcmin": 1 / 60, "arcsec": 1 / 3600}
 UNITS: Final = (*LENGTHS, *ANGLES)
 ACTUAL, TRIM = 0, 1
 """COMP_FILE_TYPE: the actual positions at a nominal one, or what is to be added there."""
-_NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
+_NUMBER: Final = re.compile(r"[-+]?(\d+(?:\.\d*)?|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
 _NUMBER_CHARS_MAX: Final = 40
 _COMMENTS: Final = ("#", ";")
 _COLUMNS: Final = ("position", "forward", "reverse")

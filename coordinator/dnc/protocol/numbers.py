@@ -14,7 +14,7 @@ from coordinator.dnc.files import FileRefused
 _DIALOG: Final = re.compile(rb"\s*0\s+BEGIN PGM\b")
 _DIALOG_END: Final = re.compile(rb"\s*\d+\s+END PGM\b")
 _DIALOG_NUMBER: Final = re.compile(rb"\s*(\d{1,9})(?=\s|$)")
-_N_WORD: Final = re.compile(rb"\s*/?\s*[Nn](\d{1,9})(?!\d)")
+_N_WORD: Final = re.compile(rb"\s*(?:/\s*)?[Nn](\d{1,9})(?!\d)")
 
 
 class LineNumbers:

@@ -14,6 +14,7 @@ from coordinator.config.options import SectionSpec, TextOption
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parameters import needed
 from coordinator.gcode.parser import WordError, quoted
+from coordinator.gcode.script_lines import script_lines
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
 from coordinator.runtime.module_context import ModuleContext
@@ -106,7 +107,7 @@ def read_variables(path: Path) -> dict[str, Any]:
             f"the file of variables {shown_path(str(path))} is larger than {FILE_BYTES_MAX} bytes"
         )
     found: dict[str, Any] = {}
-    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
+    for number, line in enumerate(script_lines(data.decode("utf-8", "replace")), 1):
         text = line.strip()
         if not text or text.startswith(("#", ";", "[")):
             continue

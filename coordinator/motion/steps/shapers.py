@@ -16,7 +16,7 @@ VIBRATION = 0.05
 """Share of the vibration that the ei shapers let through at their own frequency, unless their v_tol says."""
 TOLERANT_KINDS = ("ei", "2hump_ei", "3hump_ei")
 MAX_TOLERANCE = 0.5
-_WRITTEN = re.compile(r"([a-z0-9_]+)(?:\( *v_tol *= *(\d*\.?\d+|\d+\.) *\))?", re.ASCII)
+_WRITTEN = re.compile(r"([a-z0-9_]+)(?:\( *v_tol *= *(\d+(?:\.\d*)?|\.\d+) *\))?", re.ASCII)
 
 
 def split_kind(written: str) -> tuple[str, float]:

@@ -9,6 +9,7 @@ from typing import Any, Final
 from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
 from coordinator.gcode.builtins.machine import is_tool
 from coordinator.gcode.errors import GCodeError
+from coordinator.gcode.script_lines import script_lines
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
 from coordinator.modules.module_set import INTERRUPTING
 from coordinator.modules.programs.gcode_macro import GCodeMacro
@@ -254,7 +255,7 @@ def _answer(output: Sequence[ProgramOutput]) -> Value:
 
 
 def _lines(script: str) -> list[str]:
-    lines = script.splitlines()
+    lines = script_lines(script)
     if len(lines) > LINES_MAX:
         raise ApiError(
             "bad_params", f"gcode.run: {len(lines)} lines; at most {LINES_MAX}: print a file instead"

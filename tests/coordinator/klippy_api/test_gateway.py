@@ -10,6 +10,7 @@ import pytest
 from coordinator.klippy_api.gateway import BLOCKED_S, CLIENTS_MAX
 from coordinator.klippy_api.step_dump import StepDump
 from coordinator.klippy_api.wire import MESSAGE_BYTES_MAX
+from coordinator.service.api.motion import run_script
 from tests.coordinator.klippy_api import schema
 from tests.stages.klippy_clients import KlippyApi, KlippyClient
 from tests.stages.printer import PRINTING, Printer
@@ -515,3 +516,24 @@ async def _check_crowd(api: KlippyApi) -> None:
         client.transport.close()
     await asyncio.sleep(0)
     assert not api.connect().transport.ended
+
+
+@pytest.mark.parametrize("mark", ["\x0b", "\x0c", "\x1c", "\x85", "\u2028"])
+def test_a_text_does_not_become_a_second_command(tmp_path: Path, mark: str) -> None:
+    """Failed before: whatever Python takes for the end of a line was one, here and in ``gcode.run``."""
+    printer = Printer(tmp_path, PRINTING)
+    script = f"M117 hello{mark}M118 injected"
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client = api.connect()
+            await client.listen()
+            await client.script(script)
+            await client.updates(0.3)
+            assert client.said() == []
+            assert (await client.query("display_status"))["display_status"]["message"] == (
+                "hello?M118 injected"
+            )
+        assert (await run_script(served.service, script, wait=True)).output == []
+
+    printer.serve(main)
