@@ -1,5 +1,6 @@
 """Lines of g-code from clients, in whatever state the machine is."""
 
+import asyncio
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -14,9 +15,36 @@ from coordinator.streaming.move_source import ProgramOutput
 
 ALWAYS: Final = frozenset(("M105", "M115", "STATUS", "HELP"))
 """Commands that also a machine that stopped answers."""
+LINES_MAX: Final = 5_000
+"""Of one script: ten times what ``gcode.run`` takes. Front ends send whole macros and what is pasted."""
+BYTES_MAX: Final = 131_072
 
 
-async def run_lines(service: MachineService, lines: Sequence[str], say: Callable[[str], None]) -> None:
+class Turns:
+    """Turns of the control loop, each for one script, however many clients send some."""
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+
+    async def next(self) -> None:
+        """Wait for a turn that no other script has."""
+        async with self._lock:
+            await asyncio.sleep(0)
+
+
+def check_size(script: str) -> None:
+    """Raise RequestError for a SCRIPT that is too long; it is not split for that."""
+    ends, size = script.count("\n") + script.count("\r"), len(script.encode(errors="replace"))
+    if ends > LINES_MAX or size > BYTES_MAX:
+        raise RequestError(
+            f"gcode/script: {ends:,} line ends, {size:,} bytes; at most {LINES_MAX:,} and {BYTES_MAX:,}:"
+            " print a file instead"
+        )
+
+
+async def run_lines(
+    service: MachineService, lines: Sequence[str], say: Callable[[str], None], turns: Turns
+) -> None:
     """Have LINES done; SAY gets what they answer and the service's log does not have. Raises CanductorError.
 
     A machine that stopped takes RESTART and FIRMWARE_RESTART and answers ALWAYS.
@@ -25,29 +53,35 @@ async def run_lines(service: MachineService, lines: Sequence[str], say: Callable
     if state != "ready":
         names = {line.split(maxsplit=1)[0].upper() for line in lines}
         if names <= ALWAYS and service.machine is not None:
-            _answer(service, lines, say)
+            for line in lines:
+                await turns.next()
+                _answer(service, line, say)
             return
         if state == "startup" or not names <= RESTARTS.keys():
             raise RequestError(message)
         lines = lines[:1]
+    else:
+        await turns.next()
+        state, message = state_of(service)
+        if state != "ready":  # a stop came in between: a restart would undo it
+            raise RequestError(message)
     outcome = await run_script(service, "\n".join(lines), wait=False)
     if not outcome.logged:
         for output in outcome.output:
             say(line_of(kind_of(output), output.text))
 
 
-def _answer(service: MachineService, lines: Sequence[str], say: Callable[[str], None]) -> None:
+def _answer(service: MachineService, line: str, say: Callable[[str], None]) -> None:
     """Answer what a machine that stopped still knows."""
     known = service.up_machine().modules.vocabulary.commands
-    for line in lines:
-        command = parse(line.encode(errors="replace"))
-        reader = None if command is None else known.get(command.name)
-        if command is None or reader is None:
-            raise WordError(f"this machine does not know {line.strip()[:40]}")
-        reading = reader.read(Call(command, 0, (0.0,) * 4, ""))
-        if isinstance(reading, Immediate):
-            for text in reading.replies:
-                say(line_of(reading.kind, text))
+    command = parse(line.encode(errors="replace"))
+    reader = None if command is None else known.get(command.name)
+    if command is None or reader is None:
+        raise WordError(f"this machine does not know {line.strip()[:40]}")
+    reading = reader.read(Call(command, 0, (0.0,) * 4, ""))
+    if isinstance(reading, Immediate):
+        for text in reading.replies:
+            say(line_of(reading.kind, text))
 
 
 def kind_of(output: ProgramOutput) -> ReplyKind:

@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 
+from coordinator.klippy_api import script
 from coordinator.klippy_api.gateway import BLOCKED_S, CLIENTS_MAX
 from coordinator.klippy_api.step_dump import StepDump
 from coordinator.klippy_api.wire import MESSAGE_BYTES_MAX
-from coordinator.service.api.motion import run_script
+from coordinator.service.api.motion import ScriptOutcome, run_script
+from coordinator.service.core.work import LINES_MAX
 from tests.coordinator.klippy_api import schema
 from tests.stages.klippy_clients import KlippyApi, KlippyClient
 from tests.stages.printer import PRINTING, Printer
@@ -522,18 +524,98 @@ async def _check_crowd(api: KlippyApi) -> None:
 def test_a_text_does_not_become_a_second_command(tmp_path: Path, mark: str) -> None:
     """Failed before: whatever Python takes for the end of a line was one, here and in ``gcode.run``."""
     printer = Printer(tmp_path, PRINTING)
-    script = f"M117 hello{mark}M118 injected"
+    text = f"M117 hello{mark}M118 injected"
 
     async def main(served: Served) -> None:
         async with KlippyApi.of(served, printer.config) as api:
             client = api.connect()
             await client.listen()
-            await client.script(script)
+            await client.script(text)
             await client.updates(0.3)
             assert client.said() == []
             assert (await client.query("display_status"))["display_status"]["message"] == (
                 "hello?M118 injected"
             )
-        assert (await run_script(served.service, script, wait=True)).output == []
+        assert (await run_script(served.service, text, wait=True)).output == []
+
+    printer.serve(main)
+
+
+def test_a_stopped_machine_answers_one_line_in_a_turn_of_the_loop(tmp_path: Path) -> None:
+    """Failed before: all lines of all scripts in one turn, and any number of them."""
+    printer = Printer(tmp_path, PRINTING)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client, other = api.connect(), api.connect()
+            await client.listen()
+            await client.ask("emergency_stop")
+            client.events.clear()
+            calls = [who.send("gcode/script", {"script": "M115\n" * 30}) for who in (client, other)]
+            assert (await other.answer(calls[1]))["result"] == {}
+            assert (await client.answer(calls[0]))["result"] == {}
+            await asyncio.sleep(0)
+            await client.ask("info")
+            said = [event["params"]["response"] for event in client.events if event["method"] == "said"]
+            assert len(said) == 60, "what is said in one turn comes in one message"
+
+    printer.serve(main)
+
+
+def test_scripts_are_read_one_in_a_turn_of_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Failed before: of all clients together in one turn, 2 ms each."""
+    printer = Printer(tmp_path, PRINTING)
+    turn, read_in = 0, list[int]()
+
+    async def read(_service: object, lines: str, *, wait: bool) -> ScriptOutcome:
+        assert not wait
+        assert lines.count("\n") < LINES_MAX
+        read_in.append(turn)
+        return ScriptOutcome()
+
+    async def main(served: Served) -> None:
+        nonlocal turn
+        async with KlippyApi.of(served, printer.config) as api:
+            clients = [api.connect() for _ in range(4)]
+            calls = [who.send("gcode/script", {"script": "M118 a\n" * 1_200}) for who in clients * 3]
+            while len(read_in) < 3 * len(calls):
+                turn += 1
+                await asyncio.sleep(0)
+        assert len(set(read_in)) == len(read_in)
+
+    monkeypatch.setattr(script, "run_script", read)
+    printer.serve(main)
+
+
+def test_a_stop_while_a_script_waits_for_its_turn_is_not_undone_by_it(tmp_path: Path) -> None:
+    printer = Printer(tmp_path, PRINTING)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client, other = api.connect(), api.connect()
+            restart = client.send("gcode/script", {"script": "RESTART"})
+            await asyncio.sleep(0)
+            other.send("emergency_stop")
+            assert "emergency stop" in (await client.answer(restart))["error"]["message"]
+            await client.updates(1.0)
+            assert str(served.service.state) == "shutdown"
+
+    printer.serve(main)
+
+
+def test_long_scripts_are_refused_unless_they_stop_the_machine(tmp_path: Path) -> None:
+    """Failed before: a message's 256 KiB may be 130,000 lines."""
+    printer = Printer(tmp_path, PRINTING)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client = api.connect()
+            for long in ("\n" * (script.LINES_MAX + 1), ";" * (script.BYTES_MAX + 1)):
+                assert "print a file instead" in await client.error("gcode/script", {"script": long})
+            longest = ";" * (script.BYTES_MAX - script.LINES_MAX) + "\n" * (script.LINES_MAX - 5) + "M400"
+            assert "longer than 4096" in await client.error("gcode/script", {"script": longest})
+            await client.script(*[";"] * script.LINES_MAX)
+            await client.script("\n" * 100_000 + "M112")
+            assert str(served.service.state) == "shutdown"
 
     printer.serve(main)
