@@ -59,3 +59,13 @@ def test_a_saved_variable_can_be_read_again(text: str) -> None:
     with pytest.raises(ValueError, match="no value"):
         literal(text)
     assert math.isfinite(literal("1e300"))
+
+
+@pytest.mark.parametrize(
+    "text", ["0x" + "f" * 3_900, str(2**53), f"-{2**53}", f"[1, {2**64}]", f"{{{2**64}: 1}}", f"({2**64},)"]
+)
+def test_a_variable_has_no_number_that_others_cannot_read(text: str) -> None:
+    """Failed before: msgpack ends at 64 bits, JSON at 4,300 digits, and browsers round from 2^53 on."""
+    with pytest.raises(ValueError, match="whole number beyond 9007199254740991"):
+        literal(text)
+    assert literal(f"[{2**53 - 1}, {1 - 2**53}, 1e300]") == [2**53 - 1, 1 - 2**53, 1e300]

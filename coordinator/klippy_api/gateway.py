@@ -258,6 +258,8 @@ class Gateway:
             return
         try:
             result = self.endpoints.begin(client, request)
+            if not isinstance(result, Awaitable):
+                self._succeed(connection, request, result)
         except Exception as error:  # noqa: BLE001 (a bug of one endpoint must not end the machine)
             self._fail(connection, request, self._sentence(request, error))
             return
@@ -268,8 +270,6 @@ class Gateway:
             task = asyncio.get_running_loop().create_task(self._finish(connection, request, result))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
-        else:
-            self._succeed(connection, request, result)
 
     async def _finish(self, connection: Connection, request: Request, result: Awaitable[Result]) -> None:
         try:

@@ -18,12 +18,18 @@ END: Final = b"\x03"
 MESSAGE_BYTES_MAX: Final = 262_144
 """One message of a client, without its end."""
 LIMITS: Final = Limits(nesting=64, items=8_192)
+INTEGER_BITS_MAX: Final = 64
+"""Of a number in a message that cannot be written as it is; longer ones go out as null."""
 URGENT: Final = (b"EMERGENCY_STOP", b"M112")
 """A message with one of these words, in capitals or not, overtakes all others that wait."""
 
 
 class TooLongError(CanductorError):
     """A client sends a message that nobody would read."""
+
+
+class UnwritableError(CanductorError):
+    """A message that JSON cannot carry."""
 
 
 class UnreadableError(CanductorError):
@@ -96,12 +102,22 @@ def read_request(body: bytes, *, overtaken: bool = False) -> Request:
 
 
 def encode(message: Mapping[str, Any]) -> bytes:
-    """Return MESSAGE as it is sent; numbers that JSON does not have go out as null, other things as text."""
+    """Return MESSAGE as it is sent; numbers that JSON does not have go out as null, other things as text.
+
+    Raises UnwritableError.
+    """
     try:
-        text = json.dumps(message, separators=(",", ":"), allow_nan=False, default=str)
-    except ValueError:
-        text = json.dumps(_finite(message), separators=(",", ":"), allow_nan=False, default=str)
+        try:
+            text = _dumps(message)
+        except ValueError:
+            text = _dumps(_finite(message))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise UnwritableError(f"the message cannot be written as JSON: {error}") from None
     return text.encode(errors="replace") + END
+
+
+def _dumps(message: object) -> str:
+    return json.dumps(message, separators=(",", ":"), allow_nan=False, default=str)
 
 
 def result_message(request_id: Any, result: Mapping[str, Any]) -> bytes:
@@ -122,8 +138,10 @@ def event_message(template: Mapping[str, Any], params: Mapping[str, Any]) -> byt
 
 
 def _finite(value: Any) -> Any:
-    """Return VALUE with None for what is not finite."""
+    """Return VALUE with None for numbers that are not finite, or too long to be written."""
     if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, int) and value.bit_length() > INTEGER_BITS_MAX:
         return None
     if isinstance(value, Mapping):
         return {str(key): _finite(inner) for key, inner in value.items()}

@@ -3,7 +3,7 @@
 import ast
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from coordinator.config.errors import ConfigError, Place
@@ -37,6 +37,8 @@ VARIABLE = TextOption(
 _NAMES = re.compile(r"[A-Za-z_][\w.]*", re.ASCII)
 VALUE_MAX: Final = 10_000
 """Characters of a variable's value."""
+INTEGER_MAX: Final = 2**53 - 1
+"""Every reader of JSON has it exactly, browsers and templates' numbers included; msgpack ends at 64 bits."""
 
 
 class GCodeTemplate:
@@ -110,6 +112,7 @@ class GCodeMacro(Module):
             )
         self._template = GCodeTemplate(build, GCODE)
         self.variables = {name: _first_value(build, name, raw.value) for name, raw in _family(build)}
+        self._shown = {name: plain(value) for name, value in self.variables.items()}
         rename = (build.find(RENAME) or "").upper()
         if rename and not _is_command(rename):
             raise build.reader.bad(RENAME, "is no name that a command can have")
@@ -119,7 +122,12 @@ class GCodeMacro(Module):
 
     def status(self) -> Mapping[str, Value]:
         """Report the variables."""
-        return {name: plain(value) for name, value in dict(self.variables).items()}
+        return dict(self._shown)
+
+    def set_variable(self, name: str, value: object) -> None:
+        """Give the variable NAME, which there is, another VALUE."""
+        self.variables[name] = value
+        self._shown[name] = plain(value)
 
     def stands_for(self) -> Mapping[str, set[str]]:
         """Report which words its lines have."""
@@ -169,7 +177,7 @@ class Variables(Module):
             value = words["VALUE"]  # 'a text', whose quotes the parameters have lost
 
         def act() -> None:
-            macro.variables[name] = value
+            macro.set_variable(name, value)
 
         return Immediate(act=act)
 
@@ -200,6 +208,8 @@ def literal(text: str) -> Any:
         value = ast.literal_eval(text)
     except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError):
         value = ...
+    if any(abs(number) > INTEGER_MAX for number in _integers(value)):
+        raise ValueError(f"has a whole number beyond {INTEGER_MAX}; write it as a text, or with a point")
     if not _can_be_kept(value):
         raise ValueError(
             f"is {quoted(text)}, which is no value: write 1, 0.5, True, 'text', [1, 2] or {{'a': 1}}"
@@ -216,6 +226,18 @@ def _can_be_kept(value: object) -> bool:
     if isinstance(value, list | tuple | set):
         return all(map(_can_be_kept, value))
     return value is None or isinstance(value, bool | int | str)
+
+
+def _integers(value: object) -> Iterator[int]:
+    """Return the whole numbers in VALUE."""
+    if isinstance(value, int):
+        yield value
+    elif isinstance(value, dict):
+        for pair in value.items():
+            yield from _integers(pair)
+    elif isinstance(value, list | tuple | set):
+        for inner in value:
+            yield from _integers(inner)
 
 
 def plain(value: object) -> Value:

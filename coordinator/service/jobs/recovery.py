@@ -265,7 +265,8 @@ class Recovery:
             for name, variables in work.reached.variables.items():
                 macro = service.up_machine().modules.find(name, GCodeMacro)
                 if macro is not None:
-                    macro.variables.update(variables)
+                    for variable, value in variables.items():
+                        macro.set_variable(variable, value)
             job = service.start_job(work)
             unless_done.pop_all()
         return job

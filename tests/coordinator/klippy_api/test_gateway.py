@@ -619,3 +619,17 @@ def test_long_scripts_are_refused_unless_they_stop_the_machine(tmp_path: Path) -
             assert str(served.service.state) == "shutdown"
 
     printer.serve(main)
+
+
+def test_a_result_that_cannot_be_written_is_an_error_of_its_call(tmp_path: Path) -> None:
+    """Failed before: an exception in the loop, which ended the connection."""
+    printer = Printer(tmp_path, PRINTING)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client = api.connect()
+            api.gateway.endpoints._always["info"] = lambda _client, _request: {"a": {(1, 2): 3}}
+            assert "cannot be written as JSON" in await client.error("info")
+            assert "PAUSE" in await client.ask("gcode/help")
+
+    printer.serve(main)

@@ -16,6 +16,7 @@ from coordinator.klippy_api.wire import (
     Request,
     TooLongError,
     UnreadableError,
+    UnwritableError,
     encode,
     read_request,
     result_message,
@@ -81,6 +82,17 @@ def test_an_id_is_of_any_type(number: object) -> None:
 def test_numbers_that_json_does_not_have_go_out_as_null() -> None:
     message = encode({"a": float("nan"), "b": [1.0, float("inf")], "c": {"d": -float("inf")}})
     assert json.loads(message[:-1]) == {"a": None, "b": [1.0, None], "c": {"d": None}}
+
+
+def test_what_cannot_be_written_is_null_or_fails_in_a_sentence() -> None:
+    """Failed before: with the errors of json, of all kinds."""
+    assert json.loads(encode({"a": [1, 10**5_000]})[:-1]) == {"a": [1, None]}
+    deep: list[object] = []
+    for _ in range(2_000):
+        deep = [deep]
+    for unwritable in ({"a": {(1, 2): 3}}, {"a": deep}, {"a": [float("nan"), deep]}):
+        with pytest.raises(UnwritableError, match="cannot be written as JSON"):
+            encode(unwritable)
 
 
 def test_what_came_before_a_stop_knows_that_it_was_overtaken_and_nothing_else_does() -> None:
