@@ -40,6 +40,8 @@ class SaveVariables(Module):
         self.path = Path(build.place.path).parent / name
         self._place = build.reader.place_of(FILENAME)
         self._variables: dict[str, Any] = {}
+        self._shown: dict[str, Value] = {}
+        """The same, as the status has them."""
         self._writer: _Writer | None = None
         build.add_command(
             "SAVE_VARIABLE", "Save VALUE as VARIABLE in the file", self._save, while_printing=True
@@ -51,6 +53,7 @@ class SaveVariables(Module):
             self._variables = read_variables(self.path)
         except CanductorError as error:
             raise ConfigError(self._place, str(error)) from None
+        self._shown = {name: plain(value) for name, value in self._variables.items()}
 
     async def connect(self, live: "ModuleContext") -> None:
         """Write the file from now on."""
@@ -65,7 +68,7 @@ class SaveVariables(Module):
 
     def status(self) -> Mapping[str, Value]:
         """Report the values."""
-        return {"variables": {name: plain(value) for name, value in dict(self._variables).items()}}
+        return {"variables": dict(self._shown)}
 
     def _save(self, call: Call) -> Reading:
         values = call.parameters("VARIABLE", "VALUE")
@@ -82,10 +85,19 @@ class SaveVariables(Module):
                 raise WordError(f"VALUE of SAVE_VARIABLE {problem}") from None
             value = text
 
+        _check_readable(value)
+
         def act() -> None:
-            self._variables[name] = value
+            variables = {**self._variables, name: value}
+            text = _as_text(variables)
+            if len(text.encode()) > FILE_BYTES_MAX:
+                raise WordError(
+                    f"the file of variables has no room for {name}: {FILE_BYTES_MAX:,} bytes at most"
+                )
+            self._variables = variables
+            self._shown[name] = plain(value)
             if self._writer is not None:
-                self._writer.write(_as_text(self._variables))
+                self._writer.write(text)
 
         return Immediate(act=act)
 
@@ -121,6 +133,14 @@ def read_variables(path: Path) -> dict[str, Any]:
         if not equals:
             raise CanductorError(f"{path}:{number}: there is no = in this line; correct or remove it")
     return found
+
+
+def _check_readable(value: object) -> None:
+    """Raise WordError where VALUE, once it is written, would not be read again at the next start."""
+    try:
+        literal(repr(value))
+    except ValueError as problem:
+        raise WordError(f"VALUE of SAVE_VARIABLE, once it is written, {problem}") from None
 
 
 def _as_text(variables: Mapping[str, Any]) -> str:

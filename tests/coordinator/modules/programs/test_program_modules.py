@@ -6,7 +6,7 @@ import pytest
 
 from coordinator.config.errors import ConfigError
 from coordinator.gcode.errors import GCodeError
-from coordinator.modules.programs.save_variables import read_variables
+from coordinator.modules.programs.save_variables import FILE_BYTES_MAX, read_variables
 from tests.stages.program_stage import ProgramStage
 
 
@@ -142,6 +142,26 @@ def test_mistakes_with_variables(tmp_path: Path, line: str, part: str) -> None:
     with pytest.raises(GCodeError) as error:
         variables(tmp_path).run(line)
     assert part in str(error.value)
+
+
+def test_no_variables_are_kept_that_the_next_start_refuses(tmp_path: Path) -> None:
+    """Failed before: a file beyond what a start reads; 1e15 is four characters, but is written in 18."""
+    machine = variables(tmp_path)
+    big = "y" * 3_900
+    lines = [f"SAVE_VARIABLE VARIABLE=v{number} VALUE=\"'{big}'\"" for number in range(300)]
+    assert "has no room for" in machine.error(*lines)
+    longer = ",".join(["1e15"] * 700)
+    assert "once it is written, is longer than 10000" in machine.error(
+        f"SAVE_VARIABLE VARIABLE=x VALUE=[{longer}]"
+    )
+    saved = machine.modules.status()["save_variables"]["variables"]
+    assert isinstance(saved, dict)
+    assert FILE_BYTES_MAX // 4_000 <= len(saved) < 300
+    assert "x" not in saved, "what is refused is not kept"
+    machine.run("SAVE_VARIABLE VARIABLE=v0 VALUE=1", "SAVE_VARIABLE VARIABLE=z VALUE=1")
+    text = "".join(f"{name} = {value!r}\n" for name, value in saved.items())
+    (tmp_path / "kept.cfg").write_text(text, encoding="utf-8")
+    assert variables(tmp_path).modules.status()["save_variables"] == {"variables": saved}
 
 
 @pytest.mark.parametrize(
