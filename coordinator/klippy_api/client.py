@@ -1,7 +1,6 @@
 """One client of the API: what it has sent and nobody has looked at yet, and what it listens to; no I/O."""
 
 import contextlib
-from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -9,9 +8,9 @@ from coordinator.klippy_api.move_dump import MoveDump
 from coordinator.klippy_api.step_dump import StepDump
 from coordinator.klippy_api.subscription import Subscription
 from coordinator.klippy_api.wire import (
+    MESSAGE_BYTES_MAX,
     Framer,
     Request,
-    TooLongError,
     UnreadableError,
     is_urgent,
     read_request,
@@ -40,13 +39,7 @@ class Client:
         """Calls that are not answered yet."""
         self.dropped = 0
         """Messages that could not be understood."""
-        self.fault: TooLongError | None = None
-        """Why the connection has to end."""
         self._framer = Framer()
-        self._urgent: deque[bytes] = deque()
-        self._waiting: deque[bytes] = deque()
-        self._overtaken = 0
-        """How many of those, the first ones, an urgent message has come behind."""
 
     @property
     def listens(self) -> bool:
@@ -56,51 +49,32 @@ class Client:
     @property
     def has_work(self) -> bool:
         """Whether messages wait."""
-        return bool(self._urgent or self._waiting)
+        return self._framer.has_message
 
     def receive(self, data: bytes | memoryview) -> None:
-        """Take what came; after a fault nothing is taken any more."""
-        if self.fault is not None:
-            return
-        try:
-            bodies = self._framer.feed(data)
-        except TooLongError as fault:
-            self.fault = fault
-            return
-        for body in bodies:
-            if is_urgent(body):
-                self._urgent.append(body)
-                self._overtaken = len(self._waiting)
-            else:
-                self._waiting.append(body)
+        """Take what came; ``next_request`` looks at it."""
+        self._framer.feed(data)
 
     def next_request(self) -> Request | None:
         """Return the call that is next, one that stops the machine first; None: there is none.
 
-        Raises UnreadableError for a message that is dropped.
+        Raises UnreadableError for a message that is dropped, TooLongError for one that ends the connection.
         """
-        waiting = self._urgent or self._waiting
-        if not waiting:
+        urgent = self._framer.next_urgent()
+        message = self._framer.next_message() if urgent is None else (urgent, False)
+        if message is None:
             return None
-        overtaken = waiting is self._waiting and self._overtaken > 0
-        self._overtaken -= overtaken
         try:
-            return read_request(waiting.popleft(), overtaken=overtaken)
+            return read_request(message[0], overtaken=message[1])
         except UnreadableError:
             self.dropped += 1
             raise
 
     def unread_calls(self, unread: bytes) -> list[Request]:
         """Return the calls that may stop the machine, of those that wait and in UNREAD; in any thread."""
-        if self.fault is not None:
-            return []
-        try:
-            bodies = self._framer.copy().feed(unread)
-        except TooLongError:
-            return []
         found = []
-        for body in (*self._urgent, *self._waiting, *bodies):
-            if is_urgent(body):
+        for body in self._framer.messages(unread):
+            if is_urgent(body) and len(body) <= MESSAGE_BYTES_MAX:
                 with contextlib.suppress(UnreadableError):
                     found.append(read_request(body))
         return found

@@ -15,7 +15,14 @@ from coordinator.ipc.server.unix_socket import UnixListener, may_use, peer_of
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
 from coordinator.klippy_api.subscription import Status
-from coordinator.klippy_api.wire import Request, UnreadableError, error_message, event_message, result_message
+from coordinator.klippy_api.wire import (
+    Request,
+    TooLongError,
+    UnreadableError,
+    error_message,
+    event_message,
+    result_message,
+)
 from coordinator.service.core.machine_service import MachineService, ServiceState
 from coordinator.service.state.log_ring import Entry
 from nodes.support.errors import CanductorError
@@ -78,10 +85,8 @@ class Connection(asyncio.BufferedProtocol):
 
     def receive(self, data: bytes | memoryview) -> None:
         """Take DATA."""
-        self.client.receive(data)
-        if self.client.fault is not None:
-            self.drop(str(self.client.fault))
-        elif not self.transport.is_closing():
+        if not self.transport.is_closing():
+            self.client.receive(data)
             self._scheduler.request_turn(self)
 
     def pause_writing(self) -> None:
@@ -105,6 +110,9 @@ class Connection(asyncio.BufferedProtocol):
         while not self.transport.is_closing():
             try:
                 request = self.client.next_request()
+            except TooLongError as problem:
+                self.drop(str(problem))
+                return False
             except UnreadableError as problem:
                 if self.client.dropped == 1:
                     self._gateway.notice(

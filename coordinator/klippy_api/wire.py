@@ -49,33 +49,85 @@ class Request:
 
 
 class Framer:
-    """Cuts what a client sends into messages; keeps at most MESSAGE_BYTES_MAX and one piece."""
+    """Takes what a client sends, and returns its messages one by one, those that may stop the machine first.
+
+    To take something costs nothing but its bytes: a client has as many messages read as it has turns for.
+    """
 
     def __init__(self) -> None:
         self._rest = bytearray()
         self._scanned = 0
+        """No end of a message before this."""
+        self._searched = 0
+        """No urgent word begins before this."""
+        self._overtaken = 0
+        """Bytes that an urgent message came behind."""
 
-    def copy(self) -> "Framer":
-        """Return one that has what this one has and goes on by itself; from any thread."""
-        twin = Framer()
-        twin._rest = self._rest[:]
-        return twin
-
-    def feed(self, data: bytes | memoryview) -> list[bytes]:
-        """Return the messages that DATA completes; raises TooLongError."""
+    def feed(self, data: bytes | memoryview) -> None:
+        """Take DATA."""
         self._rest += data
-        found: list[bytes] = []
-        begin = 0
-        while (end := self._rest.find(END, max(begin, self._scanned))) >= 0:
-            found.append(bytes(self._rest[begin:end]))
-            begin = end + 1
-        del self._rest[:begin]
-        self._scanned = len(self._rest)
-        if self._scanned > MESSAGE_BYTES_MAX or any(len(body) > MESSAGE_BYTES_MAX for body in found):
-            self._rest.clear()
+
+    @property
+    def has_message(self) -> bool:
+        """Whether a message is complete."""
+        return self._rest.find(END, self._scanned) >= 0
+
+    def next_urgent(self) -> bytes | None:
+        """Return the next message that may stop the machine; None: none is complete. Raises TooLongError."""
+        at = self._find_urgent()
+        end = -1 if at is None else self._rest.find(END, at)
+        if end < 0:
+            return None
+        begin = self._rest.rfind(END, 0, at) + 1
+        self._check_length(end - begin)
+        body = bytes(self._rest[begin:end])
+        del self._rest[begin : end + 1]
+        self._searched = self._overtaken = begin
+        self._scanned = min(self._scanned, begin)
+        return body
+
+    def next_message(self) -> tuple[bytes, bool] | None:
+        """Return the next message in order, but for empty ones, and whether an urgent one came behind it.
+
+        None: none is complete. Raises TooLongError.
+        """
+        self._drop(len(self._rest) - len(self._rest.lstrip(END)) if self._rest[:1] == END else 0)
+        end = self._rest.find(END, self._scanned)
+        self._check_length(len(self._rest) if end < 0 else end)
+        if end < 0:
+            self._scanned = len(self._rest)
+            return None
+        message = bytes(self._rest[:end]), self._overtaken > 0
+        self._drop(end + 1)
+        return message
+
+    def messages(self, unread: bytes) -> list[bytes]:
+        """Return all complete ones that wait here and in UNREAD; takes nothing. In any thread."""
+        return (bytes(self._rest) + unread).split(END)[:-1]
+
+    def _find_urgent(self) -> int | None:
+        if self._rest.find(END, self._searched) < 0:
+            return None  # there may be a word, but its message is not complete
+        capitals = self._rest[self._searched :].upper()
+        found = [at for word in URGENT if (at := capitals.find(word)) >= 0]
+        if not found:
+            self._searched = max(self._searched, len(self._rest) - max(map(len, URGENT)) + 1)
+            return None
+        self._searched += min(found)
+        return self._searched
+
+    def _drop(self, count: int) -> None:
+        """Forget the first COUNT bytes."""
+        if count:
+            del self._rest[:count]
             self._scanned = 0
+            self._searched = max(0, self._searched - count)
+            self._overtaken = max(0, self._overtaken - count)
+
+    def _check_length(self, length: int) -> None:
+        if length > MESSAGE_BYTES_MAX:
+            self._drop(len(self._rest))
             raise TooLongError(f"a message has more than {MESSAGE_BYTES_MAX:,} bytes")
-        return found
 
 
 def is_urgent(body: bytes) -> bool:

@@ -191,7 +191,8 @@ class WireReader:
             if end > limit:
                 raise self._too_long(f"{end:,} bytes")
             line = bytes(buffer[:end]).strip()
-            del buffer[: end + 1]
+            # Empty lines go all together: however many there are, they cost no turn of the loop.
+            del buffer[: end + 1 if line else len(buffer) - len(buffer.lstrip())]
             self._scanned = 0
             if line:
                 return line

@@ -22,6 +22,7 @@ from coordinator.klippy_api.wire import (
     result_message,
 )
 from tests.profiles import examples
+from tests.stages.call_counter import count_calls
 
 
 @given(st.lists(st.binary(max_size=40).filter(lambda body: b"\x03" not in body), max_size=6), st.data())
@@ -29,18 +30,69 @@ from tests.profiles import examples
 def test_messages_come_out_whole_however_they_are_cut(bodies: list[bytes], data: st.DataObject) -> None:
     stream = b"".join(body + b"\x03" for body in bodies)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
-    framer, found = Framer(), []
+    framer, found = Framer(), list[bytes]()
     for begin, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
-        found += framer.feed(stream[begin:end])
-    assert found == bodies
+        framer.feed(stream[begin:end])
+        found += [body for body, _ in iter(framer.next_message, None)]
+        assert not framer.has_message
+    assert found == [body for body in bodies if body]
 
 
 def test_a_message_may_have_so_many_bytes_and_no_more() -> None:
     body = b"x" * MESSAGE_BYTES_MAX
-    assert Framer().feed(body + b"\x03") == [body]
+    framer = Framer()
+    framer.feed(body + b"\x03")
+    assert framer.next_message() == (body, False)
     for too_long in (body + b"x", body + b"x\x03"):
+        framer = Framer()
+        framer.feed(too_long)
         with pytest.raises(TooLongError):
-            Framer().feed(too_long)
+            framer.next_message()
+
+
+@given(st.lists(st.sampled_from(["a", "b", "", "m112", "{EMERGENCY_STOP"]), max_size=12), st.data())
+@settings(max_examples=examples(60))
+def test_urgent_messages_come_first_however_they_are_cut(bodies: list[str], data: st.DataObject) -> None:
+    stream = "".join(body + "\x03" for body in bodies).encode()
+    cut = data.draw(st.integers(0, len(stream)))
+    framer = Framer()
+    framer.feed(stream[:cut])
+    early = stream[:cut].count(b"\x03")
+    assert taken(framer) == expected(bodies[:early])
+    framer.feed(stream[cut:])
+    assert taken(framer) == expected(bodies[early:])
+
+
+def taken(framer: Framer) -> list[tuple[str, bool]]:
+    """Return the messages of FRAMER as a client takes them, each with whether it was overtaken."""
+    found = list[tuple[str, bool]]()
+    while True:
+        urgent = framer.next_urgent()
+        message = framer.next_message() if urgent is None else (urgent, False)
+        if message is None:
+            return found
+        found.append((message[0].decode(), message[1]))
+
+
+def expected(bodies: list[str]) -> list[tuple[str, bool]]:
+    urgent = [place for place, body in enumerate(bodies) if len(body) > 1]
+    others = [(body, place < max(urgent, default=0)) for place, body in enumerate(bodies) if len(body) == 1]
+    return [(bodies[place], False) for place in urgent] + others
+
+
+@pytest.mark.parametrize("body", [b"", b"{}", b"M112", b'{"method":"x"}'])
+def test_what_is_received_costs_nothing_before_its_turn(body: bytes) -> None:
+    """Failed before: all of it was cut and searched at once, beyond the share of its client."""
+    client = Client("a client")
+    flood = (body + b"\x03") * (65_536 // (len(body) + 1))
+    assert count_calls(lambda: client.receive(flood)) < 10
+
+    def take_one() -> None:
+        with contextlib.suppress(UnreadableError):
+            client.next_request()
+
+    assert count_calls(take_one) < 100
+    assert client.has_work == bool(body), "empty ones go all together"
 
 
 @given(st.binary(max_size=200))

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from coordinator.ipc.protocol.limits import EndReason, Limits
 from coordinator.ipc.protocol.messages import Encoder, Encoding, WireReader
 from tests.profiles import examples
+from tests.stages.call_counter import count_calls
 
 LIMITS = Limits(message_timeout_s=5.0)
 plain = (
@@ -101,3 +102,15 @@ def test_what_no_message_can_carry_is_an_error_of_the_sender(encoding: Encoding,
         return
     with pytest.raises(ValueError, match=r"."):
         Encoder().message(encoding, message)
+
+
+@pytest.mark.parametrize("empty", [b"\n", b"\r\n", b" \t\n"])
+def test_empty_lines_cost_nothing_however_many_there_are(empty: bytes) -> None:
+    """Failed before: 65,536 of them were read one by one, in one turn, which no limit of messages ended."""
+    reader = WireReader(Limits())
+    reader.feed(b'{"a":1}\n' + empty * (65_536 // len(empty)) + b'{"b":2}\n', 0.0)
+    assert reader.next_message() == {"a": 1}
+    found: list[object] = []
+    assert count_calls(lambda: found.append(reader.next_message())) < 100
+    assert found == [{"b": 2}]
+    assert reader.waiting_bytes == 0
