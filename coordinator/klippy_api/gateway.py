@@ -3,7 +3,9 @@
 import asyncio
 import contextlib
 import socket
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,11 +16,12 @@ from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.unix_socket import UnixListener, may_use, peer_of
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
-from coordinator.klippy_api.subscription import Status
+from coordinator.klippy_api.subscription import Status, Subscription
 from coordinator.klippy_api.wire import (
     Request,
     TooLongError,
     UnreadableError,
+    UnwritableError,
     error_message,
     event_message,
     result_message,
@@ -38,6 +41,10 @@ BLOCKED_S: Final = 5.0
 """A client that reads nothing for so long is disconnected."""
 LINES_MAX: Final = 1_000
 """Of g-code's answers that wait to be sent together; of more the first are left out."""
+
+
+LOOKS_MAX: Final = 16
+"""That wait to be sent: with more the oldest are left out, and later ones have what they had."""
 
 
 class Connection(asyncio.BufferedProtocol):
@@ -144,6 +151,17 @@ class Connection(asyncio.BufferedProtocol):
             self.transport.abort()
 
 
+@dataclass(slots=True)
+class _Look:
+    """All objects at one moment, and who was watching then."""
+
+    status: Status
+    now_s: float
+    watching: Sequence[tuple[Connection, Subscription | None]]
+    encoded: tuple[Mapping[str, Any], Status, bytes] | None = None
+    """What was sent last: template, changes, message."""
+
+
 class Gateway:
     """Serves SERVICE, of the configuration file CONFIG; lives on the loop that starts it.
 
@@ -170,6 +188,9 @@ class Gateway:
         """Whether any client may wait for updates."""
         self._updates: asyncio.Task[None] | None = None
         self._early: asyncio.Handle | None = None
+        self._looks: deque[_Look] = deque(maxlen=LOOKS_MAX)
+        """In the order in which they were taken; those that clients have not been sent."""
+        self._sending: asyncio.Task[None] | None = None
         self._lines: list[str] = []
         self._starts = service.starts
         self._listener: UnixListener | None = None
@@ -186,9 +207,10 @@ class Gateway:
 
     async def close(self) -> None:
         """Disconnect every client and close the socket."""
-        if self._updates is not None:
-            self._updates.cancel()
-            await asyncio.gather(self._updates, return_exceptions=True)
+        for task in (self._updates, self._sending):
+            if task is not None:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
         if self._listener is not None:
             self._listener.close()
         self._close_all()
@@ -207,7 +229,7 @@ class Gateway:
             self.say(line_of(ReplyKind(str(entry["output"])), str(entry["text"])))
         if entry["kind"] == "job" and self._early is None:
             # Moonraker follows a job by each state it is in: none may be gone by the time of the next update.
-            self._early = asyncio.get_running_loop().call_soon(self._send_early)
+            self._early = asyncio.get_running_loop().call_soon(self._look_early)
         if self._service.starts != self._starts and self._service.state is ServiceState.STARTUP:
             # Clients read configuration and objects again only when they have to connect again.
             if self._starts:
@@ -313,17 +335,28 @@ class Gateway:
         while True:
             await self._subscribed.wait()
             await asyncio.sleep(UPDATE_S)
-            self._try_to_send()
+            self._look()
+            if self._sending is not None:
+                await self._sending
             with self._surviving():
                 await self._send_steps()
 
-    def _send_early(self) -> None:
+    def _look_early(self) -> None:
         self._early = None
-        self._try_to_send()
+        self._look()
 
-    def _try_to_send(self) -> None:
+    def _look(self) -> None:
+        """Look at all objects now; clients get what has changed in turns that follow."""
+        waiting = [connection for connection in self._connections if connection.client.listens]
+        if not waiting:
+            self._subscribed.clear()
+            return
+        watching = [(connection, connection.client.subscription) for connection in waiting]
         with self._surviving():
-            self._send_changes()
+            status = self.endpoints.status.build() if any(seen for _, seen in watching) else {}
+            self._looks.append(_Look(status, self._service.now_s, watching))
+        if self._sending is None or self._sending.done():
+            self._sending = asyncio.get_running_loop().create_task(self._send_looks())
 
     @contextlib.contextmanager
     def _surviving(self) -> Iterator[None]:
@@ -337,38 +370,42 @@ class Gateway:
                 {"message": "canductor: an update of the Klippy API failed", "exception": error}
             )
 
-    def _send_changes(self) -> None:
-        waiting = [connection for connection in self._connections if connection.client.listens]
-        if not waiting:
-            self._subscribed.clear()
-        reading = [connection for connection in waiting if connection.writable]
-        self._send_moves(reading)
-        watching = [connection for connection in reading if connection.client.subscription is not None]
-        if not watching:
-            return
-        status, now_s = self.endpoints.status.build(), self._service.now_s
-        # Clients that watch the same have the same changes: those are encoded once.
-        encoded: tuple[Mapping[str, Any], Status, bytes] | None = None
-        for connection in watching:
-            subscription = connection.client.subscription
-            changed = None if subscription is None else subscription.changes(status)
-            if subscription is None or not changed:
-                continue
-            if encoded is None or encoded[:2] != (subscription.template, changed):
-                params = {"eventtime": now_s, "status": changed}
-                encoded = subscription.template, changed, event_message(subscription.template, params)
-            connection.send(encoded[2])
+    async def _send_looks(self) -> None:
+        """Send what was seen, one client in each turn of the loop."""
+        while self._looks:
+            look = self._looks.popleft()
+            for connection, subscription in look.watching:
+                with self._surviving():
+                    await self._send_moves(connection)
+                    # One that has subscribed again since then knows more than this.
+                    if subscription is not None and connection.client.subscription is subscription:
+                        self._send_changes(connection, subscription, look)
+                await asyncio.sleep(0)
 
-    def _send_moves(self, reading: list[Connection]) -> None:
-        motion, machine = self._service.motion, self._service.machine
-        if motion is None or machine is None or machine.stopped is not None:
+    def _send_changes(self, connection: Connection, subscription: Subscription, look: _Look) -> None:
+        changed = subscription.changes(look.status) if connection.writable else {}
+        if not changed:
             return
-        active = motion.planned.status.active
-        for connection in reading:
-            for dump in connection.client.move_dumps:
-                rows = dump.take(motion.trace, motion.now_s, active)
-                if rows:
-                    connection.send(event_message(dump.template, {"data": rows}))
+        # Clients that watch the same have the same changes: those are encoded once.
+        if look.encoded is None or look.encoded[:2] != (subscription.template, changed):
+            params = {"eventtime": look.now_s, "status": changed}
+            try:
+                message = event_message(subscription.template, params)
+            except UnwritableError as error:
+                self.notice(f"an update for {connection.client.peer} of the Klippy API was left out: {error}")
+                return
+            look.encoded = subscription.template, changed, message
+        connection.send(look.encoded[2])
+
+    async def _send_moves(self, connection: Connection) -> None:
+        for dump in connection.client.move_dumps:
+            motion, machine = self._service.motion, self._service.machine
+            if motion is None or machine is None or machine.stopped is not None or not connection.writable:
+                return
+            rows = dump.take(motion.trace, motion.now_s, motion.planned.status.active)
+            if rows:
+                connection.send(event_message(dump.template, {"data": rows}))
+                await asyncio.sleep(0)
 
     async def _send_steps(self) -> None:
         for connection in list(self._connections):

@@ -1,6 +1,7 @@
 """The gateway on a service in virtual time: what Moonraker asks for, in its order, and what comes back."""
 
 import asyncio
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -631,5 +632,29 @@ def test_a_result_that_cannot_be_written_is_an_error_of_its_call(tmp_path: Path)
             api.gateway.endpoints._always["info"] = lambda _client, _request: {"a": {(1, 2): 3}}
             assert "cannot be written as JSON" in await client.error("info")
             assert "PAUSE" in await client.ask("gcode/help")
+
+    printer.serve(main)
+
+
+def test_clients_are_updated_one_in_a_turn_of_the_loop(tmp_path: Path) -> None:
+    """Failed before: all of them in one, with all that they watch."""
+    printer = Printer(tmp_path, PRINTING)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            clients = [api.connect() for _ in range(6)]
+            for client in clients:
+                await client.watch({"webhooks": None})
+            await clients[0].updates(1.0)
+            for client in clients:
+                client.transport.written.clear()
+            served.service.emergency_stop("a test")
+            api.gateway.note({"kind": "job", "text": ""})
+            written = [0]
+            while written[-1] < len(clients):
+                await asyncio.sleep(0)
+                written.append(sum(bool(client.transport.written) for client in clients))
+            steps = [after - before for before, after in itertools.pairwise(written)]
+            assert max(steps) == 1
 
     printer.serve(main)

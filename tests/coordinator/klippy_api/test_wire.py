@@ -205,3 +205,15 @@ def test_a_subscription_tells_whole_fields_that_changed() -> None:
     assert subscription.changes(later) == {"fan": {"speed": 0.5}, "toolhead": {"position": [0, 0, 1, 0]}}
     assert subscription.changes(later) == {}
     assert subscription.changes({"none": {"came": 1}}) == {"none": {"came": 1}}
+
+
+def test_a_subscription_costs_what_there_is_and_not_what_is_wanted() -> None:
+    """Failed before: each of 8,000 fields that no object has was looked at in each update."""
+    status: Status = {"fan": {"speed": 0.0}, "toolhead": {"position": [0, 0, 0, 0]}}
+    unknown = [f"field{number}" for number in range(8_000)]
+    subscription = Subscription({}, {"fan": ["speed", *unknown], **dict.fromkeys(unknown[:900])})
+    assert subscription.begin(status)["fan"]["field7999"] is None
+    assert count_calls(lambda: subscription.changes(status)) < 50
+    assert subscription.changes({"fan": {"field7": 1}}) == {"fan": {"speed": None, "field7": 1}}
+    assert subscription.changes({"fan": {"field7": 1}}) == {}
+    assert subscription.changes(status) == {"fan": {"speed": 0.0, "field7": None}}
