@@ -8,6 +8,7 @@ stand within one another: the begin of one ends the one before.
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 from coordinator.config.options import SectionSpec
@@ -20,7 +21,11 @@ from coordinator.support.quoting import nearest_or_all
 from coordinator.support.values import Value
 
 OBJECTS_MAX: Final = 1000
+NAME_MAX: Final = 512
+"""Characters; slicers make names of those of files."""
 POINTS_MAX: Final = 1000
+ALL_POINTS_MAX: Final = 10_000
+"""Of all objects: clients get them whenever one is added. Slicers write 4 to some 30 for each."""
 _SPEED_MM_S: Final = 30.0
 """At which filament is drawn back or pushed forward behind an excluded object."""
 
@@ -30,6 +35,17 @@ class _Object:
     name: str
     center: tuple[float, float] | None = None
     polygon: tuple[tuple[float, float], ...] = ()
+
+    @cached_property
+    def shown(self) -> Value:
+        """As the status has it; the same at each look."""
+        return _status(self)
+
+    def simplified(self) -> "_Object":
+        """Return it with the rectangle around its polygon: enough for a mesh, and to see where it is."""
+        xs, ys = zip(*self.polygon, strict=True)
+        corners = ((min(xs), min(ys)), (max(xs), min(ys)), (max(xs), max(ys)), (min(xs), max(ys)))
+        return _Object(self.name, self.center, corners)
 
 
 class ExcludeObject(Module):
@@ -57,7 +73,7 @@ class ExcludeObject(Module):
     def status(self) -> Mapping[str, Value]:
         """Report the objects, which of them are left out, and which one is being read."""
         return {
-            "objects": [_status(found) for found in tuple(self._objects.values())],
+            "objects": [found.shown for found in tuple(self._objects.values())],
             "excluded_objects": self.excluded,
             "current_object": self._current,
         }
@@ -111,7 +127,7 @@ class ExcludeObject(Module):
         if "NAME" not in values:
             known = " ".join(self._objects) or "none"
             if flag(call.command, values, "JSON"):
-                known = json.dumps([_status(found) for found in self._objects.values()])
+                known = json.dumps([found.shown for found in self._objects.values()])
             return Immediate((f"Known objects: {known}",))
         found = _Object(
             values["NAME"].upper(),
@@ -123,7 +139,11 @@ class ExcludeObject(Module):
     def _know(self, found: _Object) -> None:
         if found.name not in self._objects and len(self._objects) >= OBJECTS_MAX:
             raise WordError(f"the program has more than {OBJECTS_MAX} objects; leave some undefined")
-        self._objects[found.name] = found
+        if len(found.name) > NAME_MAX:
+            raise WordError(f"an object has a name of {len(found.name)} characters; {NAME_MAX} at most")
+        points = sum(len(other.polygon) for other in self._objects.values() if other.name != found.name)
+        fits = len(found.polygon) <= 4 or points + len(found.polygon) <= ALL_POINTS_MAX
+        self._objects[found.name] = found if fits else found.simplified()
 
     def _reset(self, job: ProgramContext) -> bool:
         done = self._make_moves(job)

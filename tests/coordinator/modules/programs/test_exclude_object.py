@@ -1,10 +1,12 @@
 """Objects that are left out: their moves are not made, and the filament is where the next one expects it."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from coordinator.gcode.errors import GCodeError
+from coordinator.modules.programs.exclude_object import ALL_POINTS_MAX
 from tests.stages.program_stage import ProgramStage
 
 DEFINED = (
@@ -55,6 +57,31 @@ def test_objects_are_known(machine: ProgramStage) -> None:
     ]
     machine.run("EXCLUDE_OBJECT_DEFINE RESET=1")
     assert machine.modules.status()["exclude_object"]["objects"] == []
+
+
+def test_points_of_all_objects_are_bounded_and_made_once(machine: ProgramStage) -> None:
+    """Failed before: 540,000 of them, and all were made again at each look at the status."""
+    zigzag = ",".join(f"[{number % 7},{number}]" for number in range(400))
+    machine.run(*(f"EXCLUDE_OBJECT_DEFINE NAME=o{number} POLYGON=[{zigzag}]" for number in range(100)))
+    objects = shown(machine)
+    assert len(objects) == 100
+    assert objects[24]["polygon"][1] == [1.0, 1.0]
+    assert objects[25]["polygon"] == [[0.0, 0.0], [6.0, 0.0], [6.0, 399.0], [0.0, 399.0]]
+    assert sum(len(found["polygon"]) for found in objects) == ALL_POINTS_MAX + 75 * 4
+    assert all(again is found for again, found in zip(shown(machine), objects, strict=True))
+    machine.run(
+        "EXCLUDE_OBJECT_DEFINE NAME=o0 CENTER=1,1", f"EXCLUDE_OBJECT_DEFINE NAME=o0 POLYGON=[{zigzag}]"
+    )
+    assert len(shown(machine)[0]["polygon"]) == 4, "those of others count"
+    machine.run("EXCLUDE_OBJECT_DEFINE RESET=1", f"EXCLUDE_OBJECT_DEFINE NAME=o0 POLYGON=[{zigzag}]")
+    assert len(shown(machine)[0]["polygon"]) == 400
+    assert "512 at most" in machine.error("EXCLUDE_OBJECT_DEFINE NAME=" + "n" * 513)
+
+
+def shown(machine: ProgramStage) -> list[Any]:
+    objects = machine.modules.status()["exclude_object"]["objects"]
+    assert isinstance(objects, list)
+    return objects
 
 
 def test_moves_of_an_excluded_object_are_left_out(machine: ProgramStage) -> None:
