@@ -43,6 +43,8 @@ LINES_MAX: Final = 1_000
 """Of g-code's answers that wait to be sent together; of more the first are left out."""
 
 
+LINES_CHARS_MAX: Final = 65_536
+"""Likewise; the line that reaches it is the last one."""
 LOOKS_MAX: Final = 16
 """That wait to be sent: with more the oldest are left out, and later ones have what they had."""
 
@@ -192,6 +194,7 @@ class Gateway:
         """In the order in which they were taken; those that clients have not been sent."""
         self._sending: asyncio.Task[None] | None = None
         self._lines: list[str] = []
+        self._lines_chars = 0
         self._starts = service.starts
         self._listener: UnixListener | None = None
         self._scheduler = FairScheduler()
@@ -422,11 +425,12 @@ class Gateway:
             return
         if not self._lines:
             asyncio.get_running_loop().call_soon(self._say_all)
-        if len(self._lines) < LINES_MAX:
+        if len(self._lines) < LINES_MAX and self._lines_chars < LINES_CHARS_MAX:
             self._lines.append(text)
+            self._lines_chars += len(text)
 
     def _say_all(self) -> None:
-        text, self._lines = "\n".join(self._lines), []
+        text, self._lines, self._lines_chars = "\n".join(self._lines), [], 0
         for connection in list(self._connections):
             if connection.client.output is not None:
                 connection.send(event_message(connection.client.output, {"response": text}))

@@ -43,6 +43,10 @@ RUN_DRY_S: Final = 0.8
 REST_BORDER_S: Final = 0.15
 """At rest everything up to so far ahead of now counts as generated; below START_LEAD_S."""
 LINES_AT_ONCE: Final = 200
+OUTPUT_AT_ONCE: Final = 50
+"""Replies and notices of one cycle: the control loop shows them in one turn."""
+OUTPUT_CHARS_AT_ONCE: Final = 65_536
+"""Likewise; the one that reaches it is the last one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,11 +246,15 @@ class MotionWorker:
         )
 
     def _advance(self, output: list[ProgramOutput]) -> Event | None:
-        """Step the job until it has to wait for something, or LINES_AT_ONCE are done."""
+        """Step the job until it has to wait for something, or as much as one cycle may have is done."""
+        chars = 0
         for _ in range(LINES_AT_ONCE):
             event = self._job.step()
             if isinstance(event, Reply | Notice):
                 output.append(event)
+                chars += len(event.text)
+                if len(output) >= OUTPUT_AT_ONCE or chars >= OUTPUT_CHARS_AT_ONCE:
+                    return None
             elif isinstance(event, Progress):
                 continue
             elif isinstance(event, Timed):

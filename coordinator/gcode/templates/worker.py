@@ -17,13 +17,17 @@ from jinja2 import ChainableUndefined, Template
 
 from coordinator.gcode.templates.messages import encode_answer, read_request
 from coordinator.gcode.templates.rendering import Ended, Failed, TemplateCompiler
-from coordinator.gcode.templates.sandbox import Meter
+from coordinator.gcode.templates.sandbox import Meter, TooMuch
 
 MEMORY_BYTES: Final = 64 * 1024 * 1024
 """That rendering may take, beyond what the process has at its start."""
 KEPT_BYTES_MAX: Final = MEMORY_BYTES // 4
 """That renderings may leave behind, all together; a process that keeps more is replaced. What is free in it
 is in pieces, and a template that needs little would find too little."""
+ACTIONS_MAX: Final = 1_000
+"""Of one rendering: whoever shows lines and calls clients has other things to do."""
+TEXT_MAX: Final = 2_000
+"""Characters of a line to show, or of a sentence; as the log keeps. The rest is left out."""
 _STATM: Final = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
 _ALONE_CPU_S: Final = 3
 """Processor time for one request after which the kernel ends the process, when nobody else does."""
@@ -82,16 +86,16 @@ class Actions:
         """Return what templates know of it."""
 
         def respond(text: object) -> str:
-            return self._add("respond", str(text))
+            return self._add("respond", str(text)[:TEXT_MAX])
 
         def call_remote(method: object, **values: object) -> str:
             return self._add("call", str(method), {name: _plain(value) for name, value in values.items()})
 
         def fail(text: object) -> str:
-            raise Ended(str(text))
+            raise Ended(str(text)[:TEXT_MAX])
 
         def stop(text: object = "") -> str:
-            raise Ended(str(text), emergency=True)
+            raise Ended(str(text)[:TEXT_MAX], emergency=True)
 
         return {
             "action_respond_info": respond,
@@ -101,6 +105,8 @@ class Actions:
         }
 
     def _add(self, *action: object) -> str:
+        if len(self.asked) >= ACTIONS_MAX:
+            raise TooMuch(f"more than {ACTIONS_MAX:,} lines to show and calls of clients")
         self._meter.turn()
         self._meter.text(len(json.dumps(action)))
         self.asked.append(action)

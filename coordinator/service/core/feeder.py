@@ -40,6 +40,8 @@ COME_BACK_MM_S: Final = 50.0
 """At which a job goes back to where it was paused."""
 OUTPUT_MAX: Final = 1000
 """Replies and notices that are kept of one work."""
+OUTPUT_CHARS_MAX: Final = 262_144
+"""Of these together; the one that reaches it is the last one."""
 
 
 class FeederFull(CanductorError):  # noqa: N818
@@ -53,6 +55,7 @@ class QueuedWork:
     work: Work
     is_job: bool = False
     output: list[Reply | Notice] = field(default_factory=list)
+    output_chars: int = 0
     progress: Progress = NO_PROGRESS
     """How far it is read."""
     cancelled: bool = False
@@ -421,5 +424,6 @@ class Feeder:
 
 
 def _keep(queued: QueuedWork, event: Reply | Notice) -> None:
-    if len(queued.output) < OUTPUT_MAX:
+    if len(queued.output) < OUTPUT_MAX and queued.output_chars < OUTPUT_CHARS_MAX:
         queued.output.append(event)
+        queued.output_chars += len(event.text)

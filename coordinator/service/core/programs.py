@@ -134,6 +134,7 @@ class Programs:
                 queued = await motion.do_interjection(work)
                 for output in queued.output:
                     self._service.report(output)
+                    await asyncio.sleep(0)  # there may be a thousand
             else:
                 queued = await motion.do(work)
         except FeederFull as error:

@@ -658,3 +658,23 @@ def test_clients_are_updated_one_in_a_turn_of_the_loop(tmp_path: Path) -> None:
             assert max(steps) == 1
 
     printer.serve(main)
+
+
+def test_replies_are_shown_few_in_a_turn_of_the_loop(tmp_path: Path) -> None:
+    """Failed before: 200, of 4,096 characters each."""
+    printer = Printer(tmp_path, PRINTING)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client = api.connect()
+            await client.listen()
+            await client.script(*["M118 a"] * 500)
+            await client.script(*["M118 " + "b" * 3_900] * 30)
+            await client.ask("info")
+            said = [event["params"]["response"] for event in client.events if event["method"] == "said"]
+            lines = [response.split("\n") for response in said]
+            assert sum(map(len, lines)) == 530
+            assert max(map(len, lines)) == 50
+            assert max(map(len, said)) < 17 * 2_100
+
+    printer.serve(main)

@@ -432,3 +432,25 @@ def test_asking_for_what_a_section_that_exists_does_not_tell_ends_nothing(tmp_pa
 def test_an_object_that_does_not_exist_is_still_a_mistake(tmp_path: Path) -> None:
     machine = stage(tmp_path, "[gcode_macro ask]\ngcode:\n    M117 {printer.nothing.at_all}\n")
     assert "nothing" in machine.error("ASK")
+
+
+def test_replies_of_a_rendering_and_their_lengths_are_bounded(tmp_path: Path) -> None:
+    """Failed before: 20,000 of them, and a sentence of a million characters, held the control loop."""
+    machine = stage(
+        tmp_path,
+        """
+[gcode_macro MANY]
+gcode:
+    {% for _ in range(params.N|int) %}{action_respond_info("a")}{% endfor %}
+[gcode_macro LONG]
+gcode:
+    {action_respond_info("b" * 900000)}
+[gcode_macro FAIL]
+gcode:
+    {action_raise_error("c" * 900000)}
+""",
+    )
+    assert machine.run("MANY N=1000") == ["a"] * 1_000
+    assert "more than 1,000 lines to show" in machine.error("MANY N=1001")
+    assert machine.run("LONG") == ["b" * 2_000]
+    assert machine.error("FAIL").endswith(" " + "c" * 2_000)

@@ -7,7 +7,14 @@ from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Position
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import Planner
-from coordinator.service.core.feeder import INTERJECTIONS_MAX, WAITING_MAX, Feeder, FeederFull, QueuedWork
+from coordinator.service.core.feeder import (
+    INTERJECTIONS_MAX,
+    OUTPUT_CHARS_MAX,
+    WAITING_MAX,
+    Feeder,
+    FeederFull,
+    QueuedWork,
+)
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Rest, WorkError, commands_in
 from coordinator.support.examples import DEMO_MACHINE
 
@@ -30,6 +37,13 @@ def drive(feeder: Feeder, most: int = 1000) -> list[Event]:
         if isinstance(event, Idle | End | Emergency):
             return events
     raise AssertionError("the feeder does not come to an end")
+
+
+def test_what_is_kept_of_a_work_is_bounded(feeder: Feeder) -> None:
+    """Failed before: only their number was, and a reply may be a list of all objects."""
+    queued = feeder.submit(LinesWork([f"M118 {'a' * 3_900}"] * 100))
+    drive(feeder)
+    assert len(queued.output) == OUTPUT_CHARS_MAX // 3_900 + 1
 
 
 def finished(feeder: Feeder) -> list[QueuedWork]:
