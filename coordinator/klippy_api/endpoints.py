@@ -15,7 +15,7 @@ from coordinator.klippy_api.client import DUMPS_MAX, REMOTE_METHODS_MAX, Client
 from coordinator.klippy_api.move_dump import HEADER as MOVE_HEADER
 from coordinator.klippy_api.move_dump import TOOLHEAD, MoveDump
 from coordinator.klippy_api.params import RequestError, objects_param, template_param, text_param
-from coordinator.klippy_api.script import Turns, check_size, run_lines
+from coordinator.klippy_api.script import check_size, run_lines
 from coordinator.klippy_api.status import StatusBuilder, state_of
 from coordinator.klippy_api.step_dump import HEADER as STEP_HEADER
 from coordinator.klippy_api.step_dump import StepDump
@@ -59,7 +59,6 @@ class Endpoints:
         self.status = StatusBuilder(service)
         self._service = service
         self._say = say
-        self._turns = Turns()
         self._registered = registered
         self._about = {
             "hostname": platform.node(),
@@ -199,7 +198,7 @@ class Endpoints:
         lines = [line for line in script_lines(script) if line.strip()]
         try:
             for first in range(0, len(lines), LINES_MAX):
-                await run_lines(self._service, lines[first : first + LINES_MAX], self._say, self._turns)
+                await run_lines(self._service, lines[first : first + LINES_MAX], self._say)
         except CanductorError as error:
             self._say(line_of(ReplyKind.ERROR, str(error)))
             raise

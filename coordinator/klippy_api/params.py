@@ -9,6 +9,8 @@ from nodes.support.errors import CanductorError
 TEMPLATE_ITEMS_MAX: Final = 32
 OBJECTS_MAX: Final = 1024
 """In one query or subscription."""
+FIELDS_MAX: Final = 2_048
+"""Likewise, of all objects together: twice what a large machine has."""
 
 RequestedFields = Mapping[str, list[str] | None]
 """By object: its fields; None: all."""
@@ -48,6 +50,8 @@ def objects_param(request: Request) -> RequestedFields:
             raise RequestError(
                 f"{request.method}: the fields of '{name[:80]}' must be null or a list of texts"
             )
+    if sum(len(fields) for fields in found.values() if fields is not None) > FIELDS_MAX:
+        raise RequestError(f"{request.method}: the argument 'objects' has more than {FIELDS_MAX:,} fields")
     return found
 
 

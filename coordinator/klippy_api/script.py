@@ -1,6 +1,5 @@
 """Lines of g-code from clients, in whatever state the machine is."""
 
-import asyncio
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -20,18 +19,6 @@ LINES_MAX: Final = 5_000
 BYTES_MAX: Final = 131_072
 
 
-class Turns:
-    """Turns of the control loop, each for one script, however many clients send some."""
-
-    def __init__(self) -> None:
-        self._lock = asyncio.Lock()
-
-    async def next(self) -> None:
-        """Wait for a turn that no other script has."""
-        async with self._lock:
-            await asyncio.sleep(0)
-
-
 def check_size(script: str) -> None:
     """Raise RequestError for a SCRIPT that is too long; it is not split for that."""
     ends, size = script.count("\n") + script.count("\r"), len(script.encode(errors="replace"))
@@ -42,9 +29,7 @@ def check_size(script: str) -> None:
         )
 
 
-async def run_lines(
-    service: MachineService, lines: Sequence[str], say: Callable[[str], None], turns: Turns
-) -> None:
+async def run_lines(service: MachineService, lines: Sequence[str], say: Callable[[str], None]) -> None:
     """Have LINES done; SAY gets what they answer and the service's log does not have. Raises CanductorError.
 
     A machine that stopped takes RESTART and FIRMWARE_RESTART and answers ALWAYS.
@@ -54,17 +39,12 @@ async def run_lines(
         names = {line.split(maxsplit=1)[0].upper() for line in lines}
         if names <= ALWAYS and service.machine is not None:
             for line in lines:
-                await turns.next()
+                await service.turns.next()
                 _answer(service, line, say)
             return
         if state == "startup" or not names <= RESTARTS.keys():
             raise RequestError(message)
         lines = lines[:1]
-    else:
-        await turns.next()
-        state, message = state_of(service)
-        if state != "ready":  # a stop came in between: a restart would undo it
-            raise RequestError(message)
     outcome = await run_script(service, "\n".join(lines), wait=False)
     if not outcome.logged:
         for output in outcome.output:

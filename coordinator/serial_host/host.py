@@ -8,7 +8,7 @@ from collections.abc import Callable, Coroutine, Iterator, Mapping
 from typing import Any, Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
-from coordinator.klippy_api.script import Turns, run_lines
+from coordinator.klippy_api.script import run_lines
 from coordinator.klippy_api.status import state_of
 from coordinator.serial_host.protocol import BUSY, HostLine, SerialProtocol
 from coordinator.service.core.machine_service import MachineService, ServiceState
@@ -52,7 +52,6 @@ class SerialHost:
         """Being carried out."""
         self._with_ok = ""
         """What goes with the ``ok`` of that line."""
-        self._turns = Turns()
         self._ahead: list[str] = []
         """Moves that are acknowledged and not handed over."""
         self._moving: asyncio.Task[None] | None = None
@@ -157,7 +156,7 @@ class SerialHost:
         while self._ahead:
             texts, self._ahead = self._ahead, []
             self._room.set()
-            await self._shown("a move", run_lines(self._service, texts, self._say, self._turns))
+            await self._shown("a move", run_lines(self._service, texts, self._say))
 
     async def _moved(self) -> None:
         """Wait until all acknowledged moves are read."""
@@ -178,7 +177,7 @@ class SerialHost:
         while self._service.state is ServiceState.STARTUP:
             self._more.clear()
             await self._more.wait()
-        await run_lines(self._service, [line.text], self._say, self._turns)
+        await run_lines(self._service, [line.text], self._say)
 
     @contextlib.contextmanager
     def _busy(self) -> Iterator[None]:

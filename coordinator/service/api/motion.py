@@ -85,6 +85,8 @@ async def run_script(service: MachineService, script: str, *, wait: bool) -> Scr
 
     While a job prints they are done while_printing it, or between two of its lines.
     """
+    if EMERGENCY not in script.upper():
+        await _take_turn(service)
     lines = _lines(script)
     names = _commands(lines)
     if EMERGENCY in names:
@@ -105,6 +107,14 @@ async def run_script(service: MachineService, script: str, *, wait: bool) -> Scr
         work.while_printing = True
         _check_while_printing(motion, names)
         return ScriptOutcome((await _done(service, motion, work, interjected=True)).output, logged=False)
+
+
+async def _take_turn(service: MachineService) -> None:
+    """Wait until a script may be read, which takes some 2 ms; raises ApiError if a stop came first."""
+    before = service.state
+    await service.turns.next()
+    if service.state is not before and service.state is ServiceState.SHUTDOWN:  # a restart would undo it
+        raise ApiError("stopped", f"the machine stopped: {service.cause}")
 
 
 async def _run(service: MachineService, params: dict[str, Any]) -> Value:

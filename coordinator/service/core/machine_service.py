@@ -27,6 +27,7 @@ from coordinator.service.core.memory import collect_garbage, give_back, keep_sma
 from coordinator.service.core.motion import Motion
 from coordinator.service.core.programs import Programs
 from coordinator.service.core.tables import TableService
+from coordinator.service.core.turns import Turns
 from coordinator.service.core.work import FileWork
 from coordinator.service.jobs.fed import FedJobs
 from coordinator.service.jobs.history import EndedJob, JobHistory
@@ -140,6 +141,8 @@ class MachineService:
         state.bring_up_to_date = self._bring_up_to_date
         self.recovery = Recovery(self, settings.state)
         self.programs = Programs(self, self.recovery)
+        self.turns = Turns()
+        """For scripts of clients."""
         self.fed = FedJobs(self)
         self.history = JobHistory(self._notice)
         self._restart = asyncio.Event()

@@ -185,7 +185,15 @@ def test_parameters() -> None:
         text_param(request, "remote_method")
     assert objects_param(request) == {"a": None, "b": ["c"]}
     assert template_param(request) == {}
-    wrong: list[object] = [[], "a", {"a": 3}, {"a": [3]}, {"a": {}}, None]
+    wrong: list[object] = [
+        [],
+        "a",
+        {"a": 3},
+        {"a": [3]},
+        {"a": {}},
+        None,
+        {"a": ["b"] * 1_025, "c": ["d"] * 1_024},
+    ]
     for objects in wrong:
         with pytest.raises(RequestError):
             objects_param(Request("objects/query", {"objects": objects}))
