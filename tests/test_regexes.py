@@ -17,7 +17,6 @@ import coordinator
 ELSEWHERE: Final = {
     "coordinator.config.pins": "options of the owner",
     "coordinator.config.sections.kinematics.generic_cartesian": "options of the owner",
-    "coordinator.gcode.parser": "lines of at most 4,096 bytes",
     "coordinator.planning.node_dictionaries": "options and comments of the owner",
 }
 REPEATS: Final = (op.MAX_REPEAT, op.MIN_REPEAT)

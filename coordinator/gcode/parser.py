@@ -13,7 +13,7 @@ _CODE = re.compile(r"([GMTgmt])(\d{1,9})(\.\d{1,9})?(?![\d_.])", re.ASCII)
 _NAME = re.compile(r"[A-Za-z_]\w*(?=[ \t;]|$)", re.ASCII)
 _BARE_WORD = re.compile(r"[XYZEFxyzef][+-]?\.?\d", re.ASCII)
 _LINE_NUMBER = re.compile(rb"[Nn]\d+[ \t]*")
-_WORD = re.compile(r"\s*([A-Za-z])([+-]?(?:\d+\.?\d*|\.\d+)|(?=\s|$))\s*", re.ASCII)
+_WORD = re.compile(r"\s*([A-Za-z])([+-]?(?:\d+(?:\.\d*)?|\.\d+)|(?=\s|$))\s*", re.ASCII)
 _PARAMETER = re.compile(r"\s*([A-Za-z_]\w*)=(\"[^\"]*\"|'[^']*'|\S*)(?:\s+|$)", re.ASCII)
 _UNCOMMENTED = re.compile(r"(?:=\"[^\"]*\"|='[^']*'|[^;])*")
 """Parameters: a semicolon in the quotes of a value begins no comment."""
