@@ -1,9 +1,13 @@
-"""The HTTP server of the live page and of the metrics: aiohttp, bounded in connections, bytes and time."""
+"""The HTTP server of the live page and of the metrics: aiohttp, bounded in connections, bytes and time.
+
+What a client sends waits here. In each round of the loop few connections hand a bounded part of it to
+aiohttp: one whole request (request_reader.py), and the next one when that was answered.
+"""
 
 import asyncio
 import functools
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Final
 
 from aiohttp import web
@@ -11,11 +15,16 @@ from aiohttp import web
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.tcp_listener import TcpListener
 from coordinator.ipc.server.tls_transport import TlsServer
+from coordinator.web.request_reader import HttpRefusal, RequestReader
+from coordinator.web.round_robin import RECEIVE_BYTES, RoundRobin
 
 SHUTDOWN_S: Final = 1.0
 """For requests that are being answered when the port is closed."""
 UNANSWERED_MAX: Final = 16_384
 """Bytes of a request that are kept until it is answered, for the stop lane."""
+
+HEADERS: Final = {"Server": "canductor", "X-Content-Type-Options": "nosniff"}
+"""Of each answer; who asks need not know which libraries are at work."""
 
 FindStop = Callable[[str, bytes], str | None]
 """Gets an address, and what came from there and was not answered; returns who stops the machine with it, None
@@ -27,7 +36,7 @@ def _nobody(_: str, _unread: bytes) -> None:
 
 
 class HttpServer:
-    """Answers the requests at one port with ANSWER.
+    """Answers the requests at one port with ANSWER; its own answers have HEADERS. Lives on the running loop.
 
     There are CONNECTIONS_MAX connections at most, each for CONNECTION_S unless it is kept (``keep``).
     STOP_LANE finds stops in requests while the loop is held, by FIND_STOP.
@@ -39,6 +48,7 @@ class HttpServer:
         *,
         connections_max: int,
         connection_s: float,
+        headers: Mapping[str, str] = HEADERS,
         tls: TlsServer | None = None,
         stop_lane: StopLane | None = None,
         find_stop: FindStop = _nobody,
@@ -48,6 +58,8 @@ class HttpServer:
         self._find_stop = find_stop
         self._connections_max = connections_max
         self._connection_s = connection_s
+        self._headers = headers
+        self._turns = RoundRobin()
         self._logger = logging.getLogger("canductor.http")
         self._logger.addHandler(logging.NullHandler())  # what strangers send is no news
         self._logger.propagate = False
@@ -60,7 +72,7 @@ class HttpServer:
             find_stop=find_stop,
         )
         self.refused = 0
-        """Connections beyond the most."""
+        """Connections beyond the most, and requests that were not even parsed."""
         self.timed_out = 0
         """Connections that were ended after CONNECTION_S."""
 
@@ -80,22 +92,25 @@ class HttpServer:
 
     async def _answer_once(self, request: web.BaseRequest) -> web.StreamResponse:
         assert isinstance(request.protocol, _Handler)
+        handler, goes_on = request.protocol, False
         try:
-            return await self._answer(request)
+            answer = await self._answer(request)
+            if "Upgrade" in request.headers:
+                answer.force_close()  # what comes behind it is no request
+            goes_on = answer.keep_alive is not False
         finally:
-            request.protocol.note_answer()
+            handler.note_answer(goes_on=goes_on)
+        return answer
 
     @staticmethod
-    def hear(request: web.BaseRequest, feed: Callable[[bytes], None]) -> None:
-        """Have FEED get what comes on the connection of REQUEST, too, from now on."""
-        assert isinstance(request.protocol, _Handler)
-        request.protocol.hear(feed)
+    def keep(request: web.BaseRequest, feed: Callable[[bytes], None]) -> Callable[[], bytes]:
+        """Let the connection of REQUEST stay: it is a WebSocket now, and FEED gets what comes, too.
 
-    @staticmethod
-    def keep(request: web.BaseRequest) -> None:
-        """Let the connection of REQUEST stay beyond its time: it is a WebSocket now."""
+        Returns what returns, in any thread, what has come and waits for its turn.
+        """
         assert isinstance(request.protocol, _Handler)
-        request.protocol.keep()
+        request.protocol.keep(feed)
+        return request.protocol.waiting
 
     def _may_enter(self, entering: int) -> bool:
         if len(self._aiohttp.connections) + entering < self._connections_max:
@@ -109,16 +124,26 @@ class HttpServer:
             self._logger,
             self._connection_s,
             self._count_timeout,
+            self._count_refusal,
+            turns=self._turns,
+            headers=self._headers,
             lane=self._stop_lane,
             find_stop=self._find_stop,
         )
+
+    def _count_refusal(self) -> None:
+        self.refused += 1
 
     def _count_timeout(self) -> None:
         self.timed_out += 1
 
 
-class _Handler(web.RequestHandler):
-    """A connection that ends after LIMIT_S; ON_TIMEOUT is called then. LANE looks at it by FIND_STOP."""
+class _Handler(web.RequestHandler, asyncio.BufferedProtocol):
+    """A connection that ends after LIMIT_S; ON_TIMEOUT is called then. LANE looks at it by FIND_STOP.
+
+    It reads nothing from when something has come until its turn, and while a request has no answer and
+    something waits behind it.
+    """
 
     def __init__(
         self,
@@ -126,7 +151,10 @@ class _Handler(web.RequestHandler):
         logger: logging.Logger,
         limit_s: float,
         on_timeout: Callable[[], None],
+        on_refusal: Callable[[], None],
         *,
+        turns: RoundRobin,
+        headers: Mapping[str, str],
         lane: StopLane,
         find_stop: FindStop,
     ) -> None:
@@ -135,30 +163,47 @@ class _Handler(web.RequestHandler):
         self._limit_s = limit_s
         self._limit: asyncio.TimerHandle | None = None
         self._on_timeout = on_timeout
+        self._on_refusal = on_refusal
         self._lane = lane
         self._find_stop = find_stop
+        self._turns = turns
+        self._headers = headers
+        self._reader = RequestReader()
+        self._answering = False
+        """Whether aiohttp has a request without an answer."""
         self._unanswered = b""
         """What came since the last answer: half a request may have been read when the loop is held."""
-        self._reads_requests = True
         self._feed: Callable[[bytes], None] | None = None
+        """Of a WebSocket; None: requests come."""
 
-    def hear(self, feed: Callable[[bytes], None]) -> None:
-        """Have FEED get what comes, too."""
+    def keep(self, feed: Callable[[bytes], None]) -> None:
+        """Lift the limit of time; no further requests come, and FEED gets what comes, too."""
+        self._release()
         self._feed = feed
+        self._turns.request_turn(self)
 
-    def keep(self) -> None:
-        """Lift the limit of time; no further requests come."""
+    def waiting(self) -> bytes:
+        """Return what has come and waits for its turn; in any thread."""
+        return bytes(self._reader.waiting)
+
+    def _release(self) -> None:
         if self._limit is not None:
             self._limit.cancel()
         self._lane.forget(self)
-        self._reads_requests, self._unanswered = False, b""
+        self._unanswered = b""
 
-    def note_answer(self) -> None:
+    def note_answer(self, *, goes_on: bool) -> None:
         """Note that a request was carried out: the stop lane must not do it again.
 
-        What a client sends behind it without waiting for the answer waits for the loop: no browser does that.
+        If the connection GOES_ON, a request that came behind it gets its turn.
         """
-        self._unanswered = b""
+        if not goes_on:
+            self._unanswered = b""
+            self._reader.waiting.clear()
+            return
+        self._unanswered = bytes(self._reader.waiting[:UNANSWERED_MAX])
+        self._answering = False
+        self._turns.request_turn(self)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -169,24 +214,80 @@ class _Handler(web.RequestHandler):
     def _find(self, address: str, unread: bytes) -> str | None:
         return self._find_stop(address, self._unanswered + unread[:UNANSWERED_MAX])
 
-    def data_received(self, data: bytes) -> None:
-        if self._reads_requests:
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Return the shared buffer to receive into, which bounds what comes at a time."""
+        del sizehint
+        return self._turns.received
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Keep what was received for a turn."""
+        data = bytes(self._turns.received[:nbytes])
+        self._reader.waiting += data
+        if self._feed is None:
             self._unanswered = (self._unanswered + data)[:UNANSWERED_MAX]
-        if self._feed is not None:
-            self._feed(data)
+        if self.transport is not None:
+            self.transport.pause_reading()
+        self._turns.request_turn(self)
+
+    def take_turn(self) -> bool:
+        """Hand a bounded part of what waits to aiohttp; return whether there is more for another turn."""
+        if self.transport is None or (self._answering and self._feed is None):
+            return False  # ``note_answer`` requests the next turn
+        self.transport.resume_reading()  # before aiohttp gets something: it may pause, too
+        if self._feed is None:
+            self._hand_request()
+        else:
+            self._hand_bytes(self._feed)
+        must_wait = self._answering and bool(self._reader.waiting)
+        if must_wait and self.transport is not None:
+            self.transport.pause_reading()
+        return must_wait and self._feed is not None
+
+    def _hand_request(self) -> None:
+        request = self._reader.next_request()
+        if isinstance(request, HttpRefusal):
+            self._refuse(request)
+        elif request is not None:
+            self._answering = True
+            super().data_received(request)
+
+    def _hand_bytes(self, feed: Callable[[bytes], None]) -> None:
+        data = bytes(self._reader.waiting[:RECEIVE_BYTES])
+        feed(data)
+        del self._reader.waiting[:RECEIVE_BYTES]  # behind that: the stop lane finds it here or there
         super().data_received(data)
 
+    def _refuse(self, refusal: HttpRefusal) -> None:
+        """Answer and close; aiohttp gets nothing of it."""
+        body = f"{refusal.sentence}\n".encode()
+        own = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
+        headers = {**self._headers, **own, "Connection": "close"}
+        lines = [f"HTTP/1.1 {refusal.status.value} {refusal.status.phrase}"]
+        lines += [f"{name}: {value}" for name, value in headers.items()]
+        assert self.transport is not None
+        self.transport.write("\r\n".join([*lines, "", ""]).encode() + body)
+        self._unanswered = b""
+        self._reader.waiting.clear()
+        self._on_refusal()
+        self.force_close()
+
     def connection_lost(self, exc: BaseException | None) -> None:
+        """End; a request that waits for its turn is carried out before, as it may be a stop."""
+        self._turns.remove(self)
+        request = None if self._answering else self._reader.next_request()
+        if isinstance(request, bytes):
+            self._answering = True
+            super().data_received(request)
         if not self._unanswered:
-            self.keep()
-        super().connection_lost(exc)
+            self._release()
+        self._loop.call_soon(super().connection_lost, exc)  # behind the task that takes a request
 
     async def start(self) -> None:
         """Answer the requests; those that have come are carried out when the client has left, too."""
         try:
             await super().start()
         finally:
-            self.keep()
+            self._release()
 
     def _end(self) -> None:
         if self.transport is not None:

@@ -106,6 +106,7 @@ class WebServer:
             self._answer,
             connections_max=CONNECTIONS_MAX,
             connection_s=REQUEST_S,
+            headers=HEADERS,
             tls=tls,
             stop_lane=self._ipc.stop_lane,
             find_stop=functools.partial(self._find_stop, asyncio.get_running_loop()),
@@ -326,10 +327,9 @@ class WebServer:
         if self._access.note_use(session, time.time()):
             await self._save_sessions()
         unrelayed = UnrelayedMessages(self._ipc.limits.message_bytes)
-        HttpServer.hear(request, unrelayed.feed)
         await socket.prepare(request)
-        HttpServer.keep(request)
-        await self._relay(socket, request, session, unrelayed)
+        waiting = HttpServer.keep(request, unrelayed.feed)
+        await self._relay(socket, request, session, unrelayed, waiting)
         return socket
 
     async def _relay(
@@ -338,8 +338,9 @@ class WebServer:
         request: web.BaseRequest,
         session: PageSession,
         unrelayed: UnrelayedMessages,
+        waiting: Callable[[], bytes],
     ) -> None:
-        """Carry messages both ways until one side ends."""
+        """Carry messages both ways until one side ends; WAITING returns what UNRELAYED has not got."""
         transport = WebSocketTransport(socket)
         connection = self._ipc.adopt(
             transport, _address(request), functools.partial(self._check_key, session)
@@ -348,7 +349,7 @@ class WebServer:
         self._ipc.stop_lane.watch_transport(
             connection,
             request.transport,
-            lambda unread: connection.session.find_stop(unrelayed.lines(unread)),
+            lambda unread: connection.session.find_stop(unrelayed.lines(waiting() + unread)),
         )
         self._clients[connection] = session
         sending = asyncio.ensure_future(transport.run())

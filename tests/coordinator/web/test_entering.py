@@ -271,7 +271,7 @@ def test_the_session_is_found_among_cookies_of_other_ports(tmp_path: Path) -> No
                 aiohttp.ClientSession() as http,
                 http.get(f"{paged.at}/session", headers={"Cookie": header}) as answer,
             ):
-                assert answer.status == (status if len(header) < 8000 else 400), header[:80]
+                assert answer.status == (status if len(header) < 16_000 else 431), header[:80]
 
     run(tmp_path, go)
 

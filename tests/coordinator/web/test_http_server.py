@@ -1,12 +1,18 @@
 """The HTTP server under the page and the metrics; its limits are tested there, as users meet them."""
 
 import asyncio
+import contextlib
 import gc
+from collections.abc import Coroutine
 from http import HTTPStatus
+from typing import Any
 
+import pytest
 from aiohttp import web
 
 from coordinator.web.http_server import HttpServer, _Handler
+from coordinator.web.request_reader import BODY_BYTES_MAX, HEAD_BYTES_MAX
+from coordinator.web.round_robin import TURNS_PER_ROUND
 from tests.stages import jump_loop
 
 
@@ -34,3 +40,130 @@ def test_a_connection_that_is_closed_is_not_kept_until_its_time_is_over() -> Non
         await server.close()
 
     jump_loop.run(main())
+
+
+# ------------------------------------------------------------------------------------ work in a round
+
+
+class Rounds:
+    """What aiohttp gets in each round of the running loop: as many entries of bytes as calls."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.handed: list[list[int]] = [[]]
+        self._loop = asyncio.get_running_loop()
+        take = web.RequestHandler.data_received
+
+        def data_received(handler: web.RequestHandler, data: bytes) -> None:
+            self.handed[-1].append(len(data))
+            take(handler, data)
+
+        monkeypatch.setattr(web.RequestHandler, "data_received", data_received)
+        self._begin_round()
+
+    def _begin_round(self) -> None:
+        if self.handed[-1]:
+            self.handed.append([])
+        self._next = self._loop.call_soon(self._begin_round)
+
+    def end(self) -> list[list[int]]:
+        self._next.cancel()
+        return [handed for handed in self.handed if handed]
+
+
+async def send(server: HttpServer, data: bytes) -> bytes:
+    """Send DATA and return all that is answered until the server closes."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+    writer.write(data)
+    answered = b""
+    with contextlib.suppress(ConnectionError):
+        while piece := await reader.read(65_536):
+            answered += piece
+    writer.close()
+    return answered
+
+
+def run_server(go: Any, answered: list[str]) -> None:
+    async def note(request: web.BaseRequest) -> web.Response:
+        answered.append(request.path)
+        return await answer(request)
+
+    async def main() -> None:
+        server = HttpServer(note, connections_max=100, connection_s=5.0)
+        await server.open("127.0.0.1", 0)
+        steps: Coroutine[Any, Any, None] = go(server)
+        await steps
+        await server.close()
+
+    jump_loop.run(main())
+
+
+HEAD = b"POST /x HTTP/1.1\r\nHost: localhost\r\n"
+TINY_CHUNKS = HEAD + b"Transfer-Encoding: chunked\r\n\r\n" + b"1\r\na\r\n" * 20_000
+
+
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [
+        (TINY_CHUNKS, 415),
+        (HEAD + b"Content-Encoding: gzip\r\nContent-Length: 2\r\n\r\n{}", 415),
+        (HEAD + f"Content-Length: {BODY_BYTES_MAX + 1}\r\n\r\n".encode(), 413),
+        (HEAD + b"a:b\r\n" * 40_000, 431),
+    ],
+    ids=["chunks", "packed", "long body", "endless headers"],
+)
+def test_what_the_page_has_no_use_for_is_not_parsed(
+    monkeypatch: pytest.MonkeyPatch, data: bytes, status: int
+) -> None:
+    """Failed before: one connection of tiny chunks held the loop for 65 ms, 16 ended a print."""
+    answered: list[str] = []
+
+    async def go(server: HttpServer) -> None:
+        rounds = Rounds(monkeypatch)
+        (told,) = {(await send(server, data[:HEAD_BYTES_MAX]))[:12] for _ in range(2)}
+        assert told == f"HTTP/1.1 {status}".encode()
+        await asyncio.gather(*(send(server, data) for _ in range(8)))
+        assert rounds.end() == []
+        assert server.refused == 10
+
+    run_server(go, answered)
+    assert answered == []
+
+
+def test_all_connections_together_have_few_turns_in_a_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Failed before: all that had come was parsed in one round."""
+    answered: list[str] = []
+    request = b"GET /x HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    last = request[:-2] + b"Connection: close\r\n\r\n"
+
+    async def go(server: HttpServer) -> None:
+        rounds = Rounds(monkeypatch)
+        await asyncio.gather(*(send(server, request * 49 + last) for _ in range(30)))
+        handed = rounds.end()
+        assert max(map(len, handed)) <= TURNS_PER_ROUND
+        assert {size for sizes in handed for size in sizes} == {len(request), len(last)}
+
+    run_server(go, answered)
+    assert len(answered) == 30 * 50
+
+
+def test_a_connection_is_not_read_while_it_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Failed before: a client that asked without reading the answers was read all the same."""
+
+    async def go(server: HttpServer) -> None:
+        kept: list[int] = []
+        keep = _Handler.buffer_updated
+
+        def buffer_updated(handler: _Handler, nbytes: int) -> None:
+            keep(handler, nbytes)
+            kept.append(len(handler.waiting()))
+
+        monkeypatch.setattr(_Handler, "buffer_updated", buffer_updated)
+        request = b"GET /x HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        _, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.write(request * 20_000)
+        await asyncio.sleep(6)
+        assert server.timed_out == 1
+        assert max(kept) <= 2 * HEAD_BYTES_MAX
+        writer.close()
+
+    run_server(go, [])
