@@ -36,7 +36,7 @@ def _nobody(_: str, _unread: bytes) -> None:
 
 
 class HttpServer:
-    """Answers the requests at one port with ANSWER; its own answers have HEADERS. Lives on the running loop.
+    """Answers the requests at one port with ANSWER; each answer has HEADERS. Lives on the running loop.
 
     There are CONNECTIONS_MAX connections at most, each for CONNECTION_S unless it is kept (``keep``).
     STOP_LANE finds stops in requests while the loop is held, by FIND_STOP.
@@ -94,13 +94,29 @@ class HttpServer:
         assert isinstance(request.protocol, _Handler)
         handler, goes_on = request.protocol, False
         try:
-            answer = await self._answer(request)
+            answer = await self._answer_or_report(request)
+            for name, value in self._headers.items():
+                answer.headers.setdefault(name, value)
             if "Upgrade" in request.headers:
                 answer.force_close()  # what comes behind it is no request
             goes_on = answer.keep_alive is not False
         finally:
             handler.note_answer(goes_on=goes_on)
         return answer
+
+    async def _answer_or_report(self, request: web.BaseRequest) -> web.StreamResponse:
+        try:
+            return await self._answer(request)
+        except ConnectionError:  # the client has left
+            raise
+        except Exception as error:  # noqa: BLE001 (a bug must not end the machine; it is reported)
+            sentence = f"the answer to {request.method} {request.path!r} failed by a mistake of the program"
+            asyncio.get_running_loop().call_exception_handler(
+                {"message": f"canductor: {sentence}", "exception": error}
+            )
+            answer = web.Response(status=500, text="a mistake of the program; please report it\n")
+            answer.force_close()
+            return answer
 
     @staticmethod
     def keep(request: web.BaseRequest, feed: Callable[[bytes], None]) -> Callable[[], bytes]:
@@ -270,6 +286,19 @@ class _Handler(web.RequestHandler, asyncio.BufferedProtocol):
         self._reader.waiting.clear()
         self._on_refusal()
         self.force_close()
+
+    def handle_error(
+        self,
+        request: web.BaseRequest,
+        status: int = 500,
+        exc: BaseException | None = None,
+        message: str | None = None,
+    ) -> web.StreamResponse:
+        """Return the answer to what aiohttp cannot parse; its own would name aiohttp and have no HEADERS."""
+        del request, exc, message
+        answer = web.Response(status=status, text="this is no HTTP request\n", headers=self._headers)
+        answer.force_close()
+        return answer
 
     def connection_lost(self, exc: BaseException | None) -> None:
         """End; a request that waits for its turn is carried out before, as it may be a stop."""

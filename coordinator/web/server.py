@@ -327,6 +327,7 @@ class WebServer:
         if self._access.note_use(session, time.time()):
             await self._save_sessions()
         unrelayed = UnrelayedMessages(self._ipc.limits.message_bytes)
+        socket.headers.update(HEADERS)
         await socket.prepare(request)
         waiting = HttpServer.keep(request, unrelayed.feed)
         await self._relay(socket, request, session, unrelayed, waiting)

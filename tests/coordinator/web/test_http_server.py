@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from aiohttp import web
 
-from coordinator.web.http_server import HttpServer, _Handler
+from coordinator.web.http_server import HEADERS, HttpServer, _Handler
 from coordinator.web.request_reader import BODY_BYTES_MAX, HEAD_BYTES_MAX
 from coordinator.web.round_robin import TURNS_PER_ROUND
 from tests.stages import jump_loop
@@ -37,6 +37,46 @@ def test_a_connection_that_is_closed_is_not_kept_until_its_time_is_over() -> Non
         await asyncio.sleep(1)
         assert handlers() == 0
         assert (server.refused, server.timed_out) == (0, 0)
+        await server.close()
+
+    jump_loop.run(main())
+
+
+# -------------------------------------------------------------------------------------------- headers
+
+
+def test_each_answer_has_the_headers_and_names_no_library() -> None:
+    """Failed before: aiohttp's own answers had its name and version, and no headers of the page."""
+
+    async def fail(request: web.BaseRequest) -> web.Response:
+        if request.path == "/raises":
+            raise web.HTTPBadRequest
+        return web.Response(body=await request.read(), status=int(request.path[1:]))
+
+    async def main() -> None:
+        failures: list[str] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, told: failures.append(told["message"]))
+        server = HttpServer(fail, connections_max=8, connection_s=30.0)
+        await server.open("127.0.0.1", 0)
+        for line, headers, status in (
+            ("GET /200 HTTP/1.1", "", 200),
+            ("GET /404 HTTP/1.1", "", 404),
+            ("GET /letters HTTP/1.1", "", 500),
+            ("GET /raises HTTP/1.1", "", 500),
+            ("POST /200 HTTP/1.1", "Content-Encoding: gzip\r\nContent-Length: 2\r\n", 415),
+            ("GET\0/200 HTTP/1.1", "", 400),
+            ("GET /200 HTTP/1.1", "a: \0\r\n", 400),
+        ):
+            request = f"{line}\r\nHost: localhost\r\n{headers}Connection: close\r\n\r\n{{}}"
+            told = await send(server, request.encode())
+            lines = told.decode().split("\r\n")
+            assert int(lines[0].split()[1]) == status, told
+            assert "aiohttp" not in told.decode()
+            assert {f"{name}: {value}" for name, value in HEADERS.items()} <= set(lines)
+        assert failures == [
+            f"canductor: the answer to GET '{path}' failed by a mistake of the program"
+            for path in ("/letters", "/raises")
+        ]
         await server.close()
 
     jump_loop.run(main())

@@ -16,7 +16,7 @@ from yarl import URL
 from coordinator.ipc.protocol.limits import Limits
 from coordinator.ipc.server.tcp_listener import HANDSHAKE_S, HANDSHAKES_MAX
 from coordinator.web.files import FOLDER
-from coordinator.web.server import CONNECTIONS_MAX, REQUEST_S
+from coordinator.web.server import CONNECTIONS_MAX, POLICY, REQUEST_S
 from coordinator.web.settings import WebSettings
 from tests.coordinator.web.paged import LOOPBACK, Paged, ask, paging, receive, rest
 from tests.stages import jump_loop
@@ -76,6 +76,22 @@ def test_packed_for_those_who_can_unpack(tmp_path: Path) -> None:
                 assert gzip.decompress(await answer.read()) == (FOLDER / "main.js").read_bytes()
             async with plain.get(url, headers={"Accept-Encoding": "identity"}) as answer:
                 assert await answer.read() == (FOLDER / "main.js").read_bytes()
+
+    run(tmp_path, go)
+
+
+def test_packed_bodies_are_refused(tmp_path: Path) -> None:
+    """Failed before: answered with 500, without the headers that keep the page safe."""
+
+    async def go(paged: Paged) -> None:
+        headers = {"Origin": paged.at, "Content-Encoding": "gzip"}
+        async with paged.http.post(f"{paged.at}/login", data=b"{}", headers=headers) as answer:
+            assert answer.status == 415
+            assert answer.headers["Content-Security-Policy"] == POLICY
+            assert answer.headers["Server"] == "canductor"
+        await paged.sign_in()
+        async with paged.socket() as page:
+            assert page._response.headers["Server"] == "canductor"
 
     run(tmp_path, go)
 
