@@ -16,7 +16,8 @@ from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.tcp_listener import TcpListener
 from coordinator.ipc.server.tls_transport import TlsServer
 from coordinator.web.request_reader import HttpRefusal, RequestReader
-from coordinator.web.round_robin import RECEIVE_BYTES, RoundRobin
+from coordinator.web.round_robin import RoundRobin
+from coordinator.web.websocket_frames import FrameIntake
 
 SHUTDOWN_S: Final = 1.0
 """For requests that are being answered when the port is closed."""
@@ -119,14 +120,20 @@ class HttpServer:
             return answer
 
     @staticmethod
-    def keep(request: web.BaseRequest, feed: Callable[[bytes], None]) -> Callable[[], bytes]:
-        """Let the connection of REQUEST stay: it is a WebSocket now, and FEED gets what comes, too.
+    def keep(request: web.BaseRequest, frames: FrameIntake) -> Callable[[], bytes]:
+        """Let the connection of REQUEST stay: it is a WebSocket now, and FRAMES lets through what comes.
 
-        Returns what returns, in any thread, what has come and waits for its turn.
+        Returns what returns, in any thread, what has come and was not let through.
         """
         assert isinstance(request.protocol, _Handler)
-        request.protocol.keep(feed)
+        request.protocol.keep(frames)
         return request.protocol.waiting
+
+    @staticmethod
+    def go_on(request: web.BaseRequest) -> None:
+        """Let more frames of the kept connection of REQUEST through, once none of their messages waits."""
+        assert isinstance(request.protocol, _Handler)
+        request.protocol.go_on()
 
     def _may_enter(self, entering: int) -> bool:
         if len(self._aiohttp.connections) + entering < self._connections_max:
@@ -189,13 +196,17 @@ class _Handler(web.RequestHandler, asyncio.BufferedProtocol):
         """Whether aiohttp has a request without an answer."""
         self._unanswered = b""
         """What came since the last answer: half a request may have been read when the loop is held."""
-        self._feed: Callable[[bytes], None] | None = None
+        self._frames: FrameIntake | None = None
         """Of a WebSocket; None: requests come."""
 
-    def keep(self, feed: Callable[[bytes], None]) -> None:
-        """Lift the limit of time; no further requests come, and FEED gets what comes, too."""
+    def keep(self, frames: FrameIntake) -> None:
+        """Lift the limit of time; no further requests come, but FRAMES."""
         self._release()
-        self._feed = feed
+        self._frames = frames
+        self.go_on()
+
+    def go_on(self) -> None:
+        """Hand over what waits, in turns."""
         self._turns.request_turn(self)
 
     def waiting(self) -> bytes:
@@ -239,7 +250,7 @@ class _Handler(web.RequestHandler, asyncio.BufferedProtocol):
         """Keep what was received for a turn."""
         data = bytes(self._turns.received[:nbytes])
         self._reader.waiting += data
-        if self._feed is None:
+        if self._frames is None:
             self._unanswered = (self._unanswered + data)[:UNANSWERED_MAX]
         if self.transport is not None:
             self.transport.pause_reading()
@@ -247,31 +258,29 @@ class _Handler(web.RequestHandler, asyncio.BufferedProtocol):
 
     def take_turn(self) -> bool:
         """Hand a bounded part of what waits to aiohttp; return whether there is more for another turn."""
-        if self.transport is None or (self._answering and self._feed is None):
-            return False  # ``note_answer`` requests the next turn
+        if self.transport is None or self._is_busy:
+            return False  # the next turn is requested by ``note_answer``, or ``go_on``
         self.transport.resume_reading()  # before aiohttp gets something: it may pause, too
-        if self._feed is None:
-            self._hand_request()
-        else:
-            self._hand_bytes(self._feed)
-        must_wait = self._answering and bool(self._reader.waiting)
+        data = self._next_request() if self._frames is None else self._frames.take(self._reader.waiting)
+        if not data:
+            return False  # more has to come
+        super().data_received(data)
+        must_wait = bool(self._reader.waiting)
         if must_wait and self.transport is not None:
             self.transport.pause_reading()
-        return must_wait and self._feed is not None
+        return must_wait and not self._is_busy
 
-    def _hand_request(self) -> None:
+    @property
+    def _is_busy(self) -> bool:
+        return self._answering if self._frames is None else self._frames.is_busy
+
+    def _next_request(self) -> bytes:
         request = self._reader.next_request()
         if isinstance(request, HttpRefusal):
             self._refuse(request)
-        elif request is not None:
-            self._answering = True
-            super().data_received(request)
-
-    def _hand_bytes(self, feed: Callable[[bytes], None]) -> None:
-        data = bytes(self._reader.waiting[:RECEIVE_BYTES])
-        feed(data)
-        del self._reader.waiting[:RECEIVE_BYTES]  # behind that: the stop lane finds it here or there
-        super().data_received(data)
+            return b""
+        self._answering = request is not None
+        return request or b""
 
     def _refuse(self, refusal: HttpRefusal) -> None:
         """Answer and close; aiohttp gets nothing of it."""

@@ -26,7 +26,7 @@ from coordinator.web.names import is_known_host, is_own_origin
 from coordinator.web.session_file import read_sessions, write_sessions
 from coordinator.web.settings import WebSettings
 from coordinator.web.stop_request import BODY_BYTES_MAX, STOP_PATH, parse_request, read_body
-from coordinator.web.websocket_frames import UnrelayedMessages
+from coordinator.web.websocket_frames import FRAMES_PER_S, FrameIntake, UnrelayedMessages
 from coordinator.web.websocket_transport import WebSocketTransport
 from nodes.support.errors import CanductorError
 
@@ -326,27 +326,23 @@ class WebServer:
             return web.Response(status=401, text="sign in first\n", headers=HEADERS)
         if self._access.note_use(session, time.time()):
             await self._save_sessions()
-        unrelayed = UnrelayedMessages(self._ipc.limits.message_bytes)
         socket.headers.update(HEADERS)
         await socket.prepare(request)
-        waiting = HttpServer.keep(request, unrelayed.feed)
-        await self._relay(socket, request, session, unrelayed, waiting)
+        await self._relay(socket, request, session)
         return socket
 
     async def _relay(
-        self,
-        socket: web.WebSocketResponse,
-        request: web.BaseRequest,
-        session: PageSession,
-        unrelayed: UnrelayedMessages,
-        waiting: Callable[[], bytes],
+        self, socket: web.WebSocketResponse, request: web.BaseRequest, session: PageSession
     ) -> None:
-        """Carry messages both ways until one side ends; WAITING returns what UNRELAYED has not got."""
+        """Carry messages both ways until one side ends."""
         transport = WebSocketTransport(socket)
         connection = self._ipc.adopt(
             transport, _address(request), functools.partial(self._check_key, session)
         )
         transport.connection = connection
+        unrelayed = UnrelayedMessages(self._ipc.limits.message_bytes)
+        end_flood = functools.partial(self._end_flood, connection, _address(request))
+        waiting = HttpServer.keep(request, FrameIntake(unrelayed, asyncio.get_running_loop().time, end_flood))
         self._ipc.stop_lane.watch_transport(
             connection,
             request.transport,
@@ -358,12 +354,15 @@ class WebServer:
         try:
             async for message in socket:
                 if message.type is not WSMsgType.TEXT or not (begun or message.data.startswith("{")):
+                    unrelayed.end()
+                    HttpServer.go_on(request)
                     await socket.close(code=1003, message=b"messages are JSON, as text")
                     break
                 begun = True
                 unrelayed.relayed()  # without an await: the stop lane finds it here or there
                 connection.receive(message.data.encode() + b"\n")
                 await transport.readable()
+                HttpServer.go_on(request)
         finally:
             del self._clients[connection]
             transport.abort()
@@ -371,6 +370,13 @@ class WebServer:
             sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
                 await sending
+
+    def _end_flood(self, connection: Connection, address: str) -> None:
+        """End CONNECTION, the page's at ADDRESS: it sends what no page does, and others would wait for it."""
+        sentence = f"more than {FRAMES_PER_S} messages or pings a second"
+        self._on_notice(f"the live page at {address} was disconnected: it sent {sentence}")
+        connection.session.end(EndReason("too_many", sentence))
+        connection.flush()
 
 
 def _address(request: web.BaseRequest) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 import aiohttp
 import pytest
+from aiohttp import web
 from yarl import URL
 
 from coordinator.ipc.protocol.limits import Limits
@@ -18,7 +19,9 @@ from coordinator.ipc.server.tcp_listener import HANDSHAKE_S, HANDSHAKES_MAX
 from coordinator.web.files import FOLDER
 from coordinator.web.server import CONNECTIONS_MAX, POLICY, REQUEST_S
 from coordinator.web.settings import WebSettings
+from coordinator.web.websocket_frames import FRAMES_MAX, FRAMES_PER_TURN
 from tests.coordinator.web.paged import LOOPBACK, Paged, ask, paging, receive, rest
+from tests.coordinator.web.strangers import masked_frame
 from tests.stages import jump_loop
 
 
@@ -126,6 +129,51 @@ def test_bytes_are_no_text(tmp_path: Path) -> None:
             assert (ended.type, ended.data) == (aiohttp.WSMsgType.CLOSE, 1003)
 
     run(tmp_path, go)
+
+
+FLOODS = {
+    "empty": masked_frame(b""),
+    "blank": masked_frame(b" "),
+    "pings": masked_frame(b"", opcode=9),
+    "parts": b"\x01" + masked_frame(b"")[1:] + (b"\x00" + masked_frame(b"")[1:]) * 40_000,
+}
+
+
+@pytest.mark.parametrize("kind", FLOODS)
+def test_a_flood_of_frames_ends_that_client(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """Failed before: 256 KiB of them were one turn, 0.2 s; pings on six connections ended a print."""
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in()
+        async with paged.socket() as good, paged.socket() as bad:
+            assert "result" in await paged.hello(good)
+            assert "result" in await paged.hello(bad)
+            handed = note_frames(monkeypatch)
+            transport = bad._writer.transport
+            transport.write((FLOODS[kind] * 40_000)[:240_000])
+            answer = (await rest(bad))[-1]
+            assert answer["error"]["code"] == "too_many"
+            assert "disconnected" in paged.served.notices.get_nowait()
+            assert max(handed) <= FRAMES_PER_TURN * len(masked_frame(b" "))
+            assert sum(handed) <= FRAMES_MAX * len(masked_frame(b" "))
+            assert "result" in await ask(good, "api.ping", 2)
+
+    run(tmp_path, go)
+
+
+def note_frames(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list that gets how many bytes of WebSockets aiohttp has got, each time."""
+    handed: list[int] = []
+    take = web.RequestHandler.data_received
+
+    def data_received(handler: web.RequestHandler, data: bytes) -> None:
+        handed.append(len(data))
+        take(handler, data)
+
+    monkeypatch.setattr(web.RequestHandler, "data_received", data_received)
+    return handed
 
 
 def test_deep_messages_and_broken_ones_are_told_why(tmp_path: Path) -> None:

@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.web.websocket_frames import UnrelayedMessages
+from coordinator.web.websocket_frames import (
+    FRAMES_MAX,
+    FRAMES_PER_S,
+    FRAMES_PER_TURN,
+    SMALL_BYTES,
+    FrameIntake,
+    UnrelayedMessages,
+)
 
 BYTES_MAX = 300_000
 TEXT, BINARY, PING, PONG = 0x81, 0x82, 0x89, 0x8A
@@ -113,3 +120,83 @@ def test_control_frames_are_not_kept() -> None:
     assert not unrelayed._rest
     unrelayed.feed(frame(0x80, b"i"))
     assert unrelayed.lines(b"") == b"hi\n"
+
+
+def test_a_look_reads_no_more_frames_than_may_come_at_once() -> None:
+    """Failed before: the stop lane read tens of thousands of tiny frames beside the loop."""
+    unrelayed, pings = UnrelayedMessages(BYTES_MAX), frame(PING, b"")
+    assert unrelayed.lines(pings * (FRAMES_MAX - 1) + HI) == b"hi\n"
+    assert unrelayed.lines(pings * FRAMES_MAX + HI) == b""
+
+
+# ------------------------------------------------------------------------------- how many are let through
+
+
+class Intake:
+    """An intake with its messages, a clock, and the floods that it has seen."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.floods = 0
+        self.messages = UnrelayedMessages(BYTES_MAX)
+        self.frames = FrameIntake(self.messages, lambda: self.now_s, self._flood)
+        self.waiting = bytearray()
+
+    def _flood(self) -> None:
+        self.floods += 1
+
+    def take(self, data: bytes = b"") -> bytes:
+        self.waiting += data
+        taken = self.frames.take(self.waiting)
+        while not self.messages.is_empty:
+            self.messages.relayed()
+        return taken
+
+
+@pytest.mark.parametrize("first", [TEXT, PING, 0x01], ids=["messages", "pings", "parts"])
+def test_few_frames_at_a_time(first: int) -> None:
+    intake, one = Intake(), frame(first, b"x" if first != 0x01 else b"")
+    stream = one * 30 if first != 0x01 else one + frame(0x00, b"") * 29
+    assert intake.take(stream) == stream[: len(one) * FRAMES_PER_TURN]
+    taken = len(one) * FRAMES_PER_TURN
+    while data := intake.take():
+        assert len(data) <= len(one) * FRAMES_PER_TURN
+        taken += len(data)
+    assert taken == len(stream)
+
+
+@given(st.lists(messages(), max_size=5), st.data())
+def test_frames_come_through_as_they_are(sent: list[tuple[bytes, bytes]], data: st.DataObject) -> None:
+    intake, stream, through, at = Intake(), b"".join(frames for _, frames in sent), b"", 0
+    while at < len(stream):
+        size = data.draw(st.integers(1, len(stream)))
+        part, at = stream[at : at + size], at + size
+        through += intake.take(part)
+        while more := intake.take():
+            through += more
+    assert through == stream
+    assert not intake.floods
+
+
+def test_the_next_frames_come_when_messages_were_relayed() -> None:
+    intake = Intake()
+    assert not intake.frames.is_busy
+    intake.frames.take(bytearray(HI))
+    assert intake.frames.is_busy
+    intake.messages.relayed()
+    assert not intake.frames.is_busy
+
+
+def test_a_flood_ends_it_once() -> None:
+    intake, ping = Intake(), frame(PING, b"")
+    for second in range(100):
+        intake.now_s = float(second)
+        for _ in range(FRAMES_PER_S):
+            assert intake.take(ping) == ping
+        large = frame(TEXT, b"x" * SMALL_BYTES)
+        assert intake.take(large) == large, "files come in large ones"
+    taken = 0
+    while data := intake.take(ping):
+        taken += len(data) // len(ping)
+    assert taken == FRAMES_MAX - FRAMES_PER_S
+    assert (bytes(intake.waiting), intake.floods, intake.frames.is_busy) == (b"", 1, True)
