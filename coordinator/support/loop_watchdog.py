@@ -255,10 +255,11 @@ class LoopWatchdog:
         self._thread.start()
 
     def close(self) -> None:
-        """Watch no more."""
-        self._closing = True
-        self._selector.timer.arm()
-        self._thread.join()
+        """Watch no more; also where it was never started, because something before it failed."""
+        if self._thread.ident is not None:
+            self._closing = True
+            self._selector.timer.arm()
+            self._thread.join()
         self._stacks.close()
         sys.setswitchinterval(self._usual_switch_s)
 
