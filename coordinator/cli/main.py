@@ -9,14 +9,12 @@ import os
 import select
 import signal
 import sys
-import tempfile
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 
 from coordinator.cli.parser import Job, build_parser, parse_command_line
+from coordinator.support.bug_log import log_bug
 from coordinator.support.interrupts import Terminated
 from coordinator.support.report import Report
-from coordinator.support.version import VERSION
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import ParserExit, UsageError
 from nodes.support.terminal import show, show_error
@@ -43,9 +41,9 @@ def main(
     try:
         status = _run(words, as_json, parse) if words else _print_help()
         sys.stdout.flush()
-    except BrokenPipeError:
+    except BrokenPipeError as error:
         if not _stdout_is_gone():
-            return _report_bug(as_json)
+            return _fail(log_bug(error), EXIT_BUG, as_json)
         _drop_stdout()
         return EXIT_BROKEN_PIPE
     finally:
@@ -81,8 +79,8 @@ def _run(words: list[str], as_json: bool, parse: Callable[[Sequence[str]], Job])
         )
     except BrokenPipeError:
         raise
-    except Exception:  # noqa: BLE001 (the last line of defence: whatever arrives here is a bug and reported as one)
-        return _report_bug(as_json)
+    except Exception as bug:  # noqa: BLE001 (the last line of defence: whatever arrives here is reported as a bug)
+        return _fail(log_bug(bug), EXIT_BUG, as_json)
 
 
 def _show(report: Report, as_json: bool) -> int:
@@ -102,18 +100,6 @@ def _fail(sentence: str, status: int, as_json: bool) -> int:
 
 def _show_json(values: Mapping[str, object]) -> None:
     show(json.dumps(values, allow_nan=False))
-
-
-def _report_bug(as_json: bool) -> int:
-    """Keep the traceback in a file: on the terminal it helps nobody."""
-    error = sys.exception() if sys.version_info >= (3, 12) else sys.exc_info()[1]
-    with tempfile.NamedTemporaryFile(
-        "w", prefix="canductor-", suffix=".log", delete=False, encoding="utf-8"
-    ) as log:
-        log.write(f"canductor {VERSION}, Python {sys.version}\n{' '.join(sys.argv)}\n\n")
-        log.write(traceback.format_exc())
-    sentence = f"internal error: {type(error).__name__}: {error}; please report it with {log.name}"
-    return _fail(" ".join(sentence.split()), EXIT_BUG, as_json)
 
 
 def _stdout_is_gone() -> bool:

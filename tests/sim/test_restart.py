@@ -322,3 +322,42 @@ def test_a_node_that_shuts_down_while_others_still_start(tmp_path: Path) -> None
         assert any("reset and started again" in line for line in stage.lines), stage.lines
 
     serve(machine, tmp_path, go)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        "tests.sim.test_restart.load_machine",
+        "coordinator.modules.module_set.ModuleSet.connect",
+        "coordinator.service.core.motion.Planner",
+    ],
+)
+def test_a_bug_that_a_start_meets_ends_the_start_and_not_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
+) -> None:
+    """The process ended, and with it its clients: the configuration said `max_velocity: 0.0005`."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    machine = heated(tmp_path, "")
+    causes: list[str] = []
+
+    def fail(*_: object) -> None:
+        raise ValueError("of a\nbug")
+
+    async def go(stage: Served) -> None:
+        await run(stage, "M104 S210\nG4 P2000")
+        assert machine.edges(HEATER, "toolhead")[-1][1] == 1
+        with monkeypatch.context() as patched:
+            patched.setattr(broken, fail)
+            await stage.call("machine.restart")
+            await stage.until(lambda: str(stage.service.state) == "error", "error")
+        causes.append(stage.service.cause)
+        await asyncio.sleep(1.0)
+        assert machine.edges(HEATER, "toolhead")[-1][1] == 0
+        await stage.call("machine.restart")
+        await stage.until(lambda: stage.service.starts == 3, "error")
+        await stage.until_state("ready")
+
+    serve(machine, tmp_path, go)
+    (log,) = tmp_path.glob("canductor-*.log")
+    assert causes == [f"internal error: ValueError: of a bug; please report it with {log}"]
+    assert "Traceback" in log.read_text()

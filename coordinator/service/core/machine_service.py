@@ -40,6 +40,7 @@ from coordinator.service.state.figures import Figures
 from coordinator.service.state.log_ring import Entry, LogRing
 from coordinator.streaming.move_source import ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
+from coordinator.support.bug_log import log_bug
 from coordinator.support.progress import Progress
 from coordinator.tables.store import TableStore
 from nodes.dictionary.cache import DictionaryCache
@@ -170,7 +171,12 @@ class MachineService:
             while True:
                 if self.settings.own_process:
                     collect_garbage()  # while there is nothing to be stopped
-                await self._live_once()
+                try:
+                    await self._live_once()
+                except Exception as bug:
+                    if self.state is not ServiceState.STARTUP:
+                        raise
+                    self._enter(ServiceState.ERROR, await asyncio.to_thread(log_bug, bug))
                 await self._restart.wait()
                 await self._let_go()
         except asyncio.CancelledError:
