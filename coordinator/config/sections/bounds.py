@@ -1,6 +1,6 @@
-"""The highest values that the configuration accepts, and options that are bounded by them alone.
+"""The extreme values that the configuration accepts, and options that are bounded by them alone.
 
-They are far above any machine, and low enough that squares and sums stay exact and a slipped digit group is
+They are far beyond any machine, and near enough that squares and sums stay exact and a slipped digit group is
 noticed.
 """
 
@@ -8,8 +8,12 @@ from coordinator.config.options import FloatOption
 
 MAX_SPEED = 100_000.0
 """mm/s."""
+MIN_SPEED = 0.001
+"""mm/s; the planner calculates with none below it (motion/planner/values.py)."""
 MAX_ACCEL = 10_000_000.0
 """mm/s²."""
+MIN_ACCEL = 0.001
+"""mm/s²; as MIN_SPEED."""
 MAX_POSITION = 100_000.0
 """mm: a hundred metres; positions stay exact to far below a step."""
 MAX_BELT_POSITION = 1e9
@@ -17,13 +21,17 @@ MAX_BELT_POSITION = 1e9
 
 
 def speed_option(name: str, text: str, default: float | None = None) -> FloatOption:
-    """Return the option NAME for a speed above 0; TEXT is its help."""
-    return FloatOption(name=name, help=text, default=default, unit="mm/s", above=0, maximum=MAX_SPEED)
+    """Return the option NAME for a speed that is not 0; TEXT is its help."""
+    return FloatOption(
+        name=name, help=text, default=default, unit="mm/s", minimum=MIN_SPEED, maximum=MAX_SPEED
+    )
 
 
 def accel_option(name: str, text: str, default: float | None = None) -> FloatOption:
-    """Return the option NAME for an acceleration above 0; TEXT is its help."""
-    return FloatOption(name=name, help=text, default=default, unit="mm/s²", above=0, maximum=MAX_ACCEL)
+    """Return the option NAME for an acceleration that is not 0; TEXT is its help."""
+    return FloatOption(
+        name=name, help=text, default=default, unit="mm/s²", minimum=MIN_ACCEL, maximum=MAX_ACCEL
+    )
 
 
 def length_option(name: str, text: str) -> FloatOption:

@@ -6,7 +6,7 @@ from coordinator.config.errors import ConfigError
 from coordinator.config.file import RawSection
 from coordinator.config.model import ExtruderDescription, ExtruderStepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec, TextOption
-from coordinator.config.sections.bounds import MAX_SPEED, accel_option, speed_option
+from coordinator.config.sections.bounds import MAX_SPEED, MIN_ACCEL, MIN_SPEED, accel_option, speed_option
 from coordinator.config.sections.heater_options import EXTRUDER_HEATER_OPTIONS, UNSUPPORTED_HEATER_OPTIONS
 from coordinator.config.sections.printer import PrinterSection
 from coordinator.config.sections.reading import Reading
@@ -17,10 +17,10 @@ from coordinator.motion.specs import MotionLimits
 from coordinator.support.quoting import nearest_or_all
 
 NOZZLE_DIAMETER = FloatOption(
-    name="nozzle_diameter", help="bore of the nozzle", unit="mm", above=0, maximum=20
+    name="nozzle_diameter", help="bore of the nozzle", unit="mm", minimum=0.01, maximum=20
 )
 FILAMENT_DIAMETER = FloatOption(
-    name="filament_diameter", help="diameter of the raw filament", unit="mm", above=0, maximum=20
+    name="filament_diameter", help="diameter of the raw filament", unit="mm", minimum=0.1, maximum=20
 )
 MAX_CROSS_SECTION = FloatOption(
     name="max_extrude_cross_section",
@@ -142,8 +142,8 @@ def _read_extruder(
         space,
         ratio=reader.get_or(MAX_CROSS_SECTION, usual_cross_section) / filament_area,
         only=(
-            reader.get_or(MAX_ONLY_VELOCITY, printer.max_velocity * usual_ratio),
-            reader.get_or(MAX_ONLY_ACCEL, printer.max_accel * usual_ratio),
+            reader.get_or(MAX_ONLY_VELOCITY, max(MIN_SPEED, printer.max_velocity * usual_ratio)),
+            reader.get_or(MAX_ONLY_ACCEL, max(MIN_ACCEL, printer.max_accel * usual_ratio)),
             reader.get(MAX_ONLY_DISTANCE),
         ),
         corner_velocity=reader.get(CORNER_VELOCITY),

@@ -39,12 +39,14 @@ SQUARE_CORNER_VELOCITY = FloatOption(
     minimum=0,
     maximum=MAX_SPEED,
 )
+MAX_CRUISE_RATIO = 0.999
+"""The planner takes no more (motion/planner/values.py)."""
 MINIMUM_CRUISE_RATIO = FloatOption(
     name="minimum_cruise_ratio",
     help="smallest share of a short move that is cruise, which limits zig-zag",
     default=0.5,
     minimum=0,
-    below=1,
+    maximum=MAX_CRUISE_RATIO,
 )
 MAX_ACCEL_TO_DECEL = accel_option(
     "max_accel_to_decel",
@@ -125,4 +127,4 @@ def _cruise_ratio(reader: SectionReader, max_accel: float) -> float:
     max_accel_to_decel = reader.find(MAX_ACCEL_TO_DECEL)
     if max_accel_to_decel is None:
         return reader.get(MINIMUM_CRUISE_RATIO)
-    return 1 - min(1.0, max_accel_to_decel / max_accel)
+    return min(MAX_CRUISE_RATIO, 1 - min(1.0, max_accel_to_decel / max_accel))

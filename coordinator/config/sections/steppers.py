@@ -20,7 +20,7 @@ ROTATION_DISTANCE = FloatOption(
     name="rotation_distance",
     help="way of the axis for one turn of the motor, or of the last gear",
     unit="mm",
-    above=0,
+    minimum=0.001,
     maximum=10_000,
 )
 FULL_STEPS = IntOption(
@@ -47,6 +47,9 @@ TURNING_GEAR_RATIO = GearRatioOption(
 TURNING_MOTOR = (STEP_PIN, DIR_PIN, ENABLE_PIN, MICROSTEPS, FULL_STEPS, TURNING_GEAR_RATIO, STEP_PULSE)
 """Of a motor that turns the bed or an arm instead of moving a rail."""
 
+MIN_STEP = 3e-7
+"""mm, or rad: all of a machine's range is then below the 1e12 steps that step generation counts to."""
+
 _EXTRA_STEPPER = re.compile(r"stepper_[a-z]+[1-9][0-9]?|dual_carriage[1-9][0-9]?", re.ASCII)
 
 
@@ -65,6 +68,14 @@ def read_stepper(
     rotation_distance = math.tau if function.turns else reader.get(ROTATION_DISTANCE)
     full_steps = reader.get(FULL_STEPS)
     gear_ratio = reader.get(TURNING_GEAR_RATIO if function.turns else GEAR_RATIO)
+    step_distance = rotation_distance / (full_steps * microsteps * gear_ratio)
+    if step_distance < MIN_STEP:
+        unit = "rad" if function.turns else "mm"
+        raise ConfigError(
+            reader.place,
+            f"a step of [{reader.name}] is {step_distance:g} {unit}, must be at least {MIN_STEP:g} {unit};"
+            " correct its gear_ratio, microsteps and the like",
+        )
     enable_pin, unpowered = _claim_enable(reader, pins)
     return StepperDescription(
         name=name or reader.name,
@@ -72,7 +83,7 @@ def read_stepper(
         dir_pin=dir_pin,
         enable_pin=enable_pin,
         function=function,
-        step_distance=rotation_distance / (full_steps * microsteps * gear_ratio),
+        step_distance=step_distance,
         rotation_distance=rotation_distance,
         full_steps_per_rotation=full_steps,
         microsteps=microsteps,

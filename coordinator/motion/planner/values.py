@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from coordinator.motion.planner._planner import lib
 from coordinator.motion.specs import MotionLimits
@@ -175,10 +175,23 @@ def check_number(
     return value
 
 
+_RANGES: Final = {
+    "tower_radius": (0, 1e6),
+    "tower_rod": (0, 1e6),
+    "cone_top": (-1e6, 1e6),
+    "minimum_cruise_ratio": (0, 0.999),
+    "max_extrude_ratio": (0, 1e12),
+}
+"""Of limits that are no speeds and the like."""
+
+
 def check_limits(limits: MotionLimits) -> None:
-    """Refuse limits the arithmetic cannot stand: they would come out as NaN."""
+    """Refuse limits the arithmetic cannot stand: they would come out as NaN.
+
+    Within these every duration and square is far from overflow and underflow.
+    """
     may_be_zero = {"square_corner_velocity", "instantaneous_corner_velocity", "max_radius", "radius_min"}
-    may_be_zero |= {"max_extrude_only_distance", "max_extrude_ratio"}  # a machine without an extruder
+    may_be_zero |= {"max_extrude_only_distance"}  # a machine without an extruder
     may_be_zero |= {f"max_{axis}_{what}" for axis in "xy" for what in ("velocity", "accel")}
     for field in fields(limits):
         if field.name == "range_options":
@@ -187,16 +200,9 @@ def check_limits(limits: MotionLimits) -> None:
         if field.name in {"position_min", "position_max"}:
             for bound in value:
                 check_number(field.name, bound, -1e6, 1e9)
-        elif field.name in {"tower_radius", "tower_rod"}:
-            check_number(field.name, value, 0, 1e6)
-        elif field.name == "cone_top":
-            check_number(field.name, value, -1e6, 1e6)
         elif field.name == "cone_slope":
             for slope in value:
                 check_number(field.name, slope, 0, 1e6)
-        elif field.name == "minimum_cruise_ratio":
-            check_number(field.name, value, 0, 0.999)
         else:
-            # Within these every duration and square is far from overflow and underflow.
-            zero = field.name in may_be_zero
-            check_number(field.name, value, 0 if zero else 1e-3, 1e9)
+            least = 0 if field.name in may_be_zero else 1e-3
+            check_number(field.name, value, *_RANGES.get(field.name, (least, 1e9)))

@@ -73,8 +73,15 @@ CASES = {
     "missing option": (
         changed("rotation_distance: 8\n", ""),
         (
-            "printer.cfg:26: [stepper_z] lacks option 'rotation_distance', a number in mm, above 0"
-            " and at most 10000: way of the axis for one turn of the motor, or of the last gear"
+            "printer.cfg:26: [stepper_z] lacks option 'rotation_distance', a number in mm, at least"
+            " 0.001 and at most 10000: way of the axis for one turn of the motor, or of the last gear"
+        ),
+    ),
+    "steps that are too small to be counted": (
+        changed("rotation_distance: 8\n", "rotation_distance: 0.5\ngear_ratio: 1000:1\n"),
+        (
+            "printer.cfg:26: a step of [stepper_z] is 1.5625e-07 mm, must be at least 3e-07 mm; correct its"
+            " gear_ratio, microsteps and the like"
         ),
     ),
     "pin used twice": (
@@ -172,7 +179,7 @@ CASES = {
         changed("max_velocity: 300", "max_velocity: 0"),
         (
             "printer.cfg:9: option 'max_velocity' of [printer] is '0', must be a number in mm/s,"
-            " above 0 and at most 100000"
+            " at least 0.001 and at most 100000"
         ),
     ),
     "above a bound": (
@@ -186,14 +193,14 @@ CASES = {
         changed("max_accel: 5000", "max_accel: fast"),
         (
             "printer.cfg:10: option 'max_accel' of [printer] is 'fast', must be a number in mm/s²,"
-            " above 0 and at most 10000000"
+            " at least 0.001 and at most 10000000"
         ),
     ),
     "not finite": (
         changed("max_accel: 5000", "max_accel: nan"),
         (
             "printer.cfg:10: option 'max_accel' of [printer] is 'nan', must be a number in mm/s²,"
-            " above 0 and at most 10000000"
+            " at least 0.001 and at most 10000000"
         ),
     ),
     "odd full steps": (

@@ -15,6 +15,10 @@ from typing import Any
 import pytest
 
 from coordinator.assembly.load import load_machine
+from coordinator.config.options import FloatOption, IntOption
+from coordinator.config.sections.extruder import EXTRUDER
+from coordinator.config.sections.printer import PRINTER
+from coordinator.config.sections.rails import RAIL
 from coordinator.planning.figures import Peak
 from coordinator.planning.options import PlanOptions
 from coordinator.planning.plan import plan_file
@@ -37,6 +41,13 @@ G1 X10 E2
 G1 Y10 E2
 G1 E-5 F1800
 """
+
+BOUNDED = [
+    (section, option)
+    for section, spec in (("printer", PRINTER), ("stepper_x", RAIL), ("extruder", EXTRUDER))
+    for option in spec.options
+    if isinstance(option, FloatOption | IntOption)
+]
 RECORD = struct.Struct("<QQB")
 DATA = Path(__file__).parents[3] / ".." / "shared" / "data"
 
@@ -308,3 +319,40 @@ def test_a_real_file_is_planned_with_all_figures(tmp_path: Path) -> None:
         )
         assert 0 < node.max_slots <= node.move_count
     assert all(0 < bus.mean_load < bus.peak_load < 1 for bus in report.buses)
+
+
+def with_option(section: str, option: str, value: str, text: str) -> str:
+    """Return the configuration TEXT with VALUE for OPTION of [SECTION]."""
+    head, header, rest = text.partition(f"[{section}]\n")
+    own, bracket, others = rest.partition("\n[")
+    assert header
+    own = re.sub(rf"^{option}: .*\n", "", own, flags=re.MULTILINE)
+    return f"{head}{header}{option}: {value}\n{own}{bracket}{others}"
+
+
+@pytest.mark.parametrize(("section", "option"), BOUNDED, ids=lambda each: getattr(each, "name", each))
+def test_what_an_option_allows_can_be_planned(
+    tmp_path: Path, section: str, option: FloatOption | IntOption
+) -> None:
+    """Or it is refused in a sentence about the machine; the planner calculates with no number it cannot."""
+    config = tmp_path / "machine.cfg"
+    for value in (option.minimum, option.maximum, 1e-300, 5e-4, 0.99999999):
+        config.write_text(with_option(section, option.name, repr(value), DEMO_MACHINE.read_text()))
+        try:
+            plan(tmp_path, config=config)
+        except CanductorError as refused:
+            assert "bug" not in str(refused)  # noqa: PT017
+
+
+def test_the_narrowest_nozzle_and_filament_can_be_planned(tmp_path: Path) -> None:
+    """The limits of filament that follow from them are within what the planner calculates with, too."""
+    text = with_option("printer", "max_velocity", "0.001", DEMO_MACHINE.read_text())
+    for option, value in (
+        ("nozzle_diameter", "0.01"),
+        ("filament_diameter", "0.1"),
+        ("max_extrude_cross_section", "1e9"),
+    ):
+        text = with_option("extruder", option, value, text)
+    config = tmp_path / "machine.cfg"
+    config.write_text(text)
+    assert plan(tmp_path, "G28\nM83\nG1 Z1 F600\n", config=config).ok

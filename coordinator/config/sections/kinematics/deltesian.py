@@ -5,7 +5,13 @@ import math
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
 from coordinator.config.sections.bounds import length_option
 from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
-from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, axis_range, home_of, tidy
+from coordinator.config.sections.kinematics.frame import (
+    Frame,
+    KinematicsKind,
+    axis_range,
+    home_at_endstops,
+    home_of,
+)
 from coordinator.config.sections.kinematics.towers import MINIMUM_Z, check_height, of_first
 from coordinator.config.sections.rails import read_rail, read_tower
 from coordinator.config.sections.reading import Reading
@@ -66,8 +72,8 @@ def read_deltesian(reading: Reading, printer: SectionReader) -> Frame:
     for reader, arm, function in zip(readers, (left, right), deltesian.step_functions()[:2], strict=True):
         homing = read_tower_homing(reader, arm.endstop_height, reading.pins)
         rails.append(read_tower(reading, reader, reader.name.removeprefix("stepper_"), function, homing))
-    home = deltesian.forward((*deltesian.endstop_positions, home_of(y)))
-    return Frame(deltesian, (*rails, y), tidy(home), range_options=RANGE_OPTIONS)
+    home = home_at_endstops(deltesian, (*deltesian.endstop_positions, home_of(y)), readers[0])
+    return Frame(deltesian, (*rails, y), home, range_options=RANGE_OPTIONS)
 
 
 def _read_side(reader: SectionReader, first: SectionReader, sign: float) -> Arm:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from coordinator.config.errors import ConfigError
 from coordinator.config.model import DualCarriageDescription, RailDescription, StepperDescription
 from coordinator.config.options import SectionReader, SectionSpec
 from coordinator.config.sections.reading import Reading
@@ -62,6 +63,21 @@ def tidy(point: Point) -> Point:
     """Return a point that was calculated without its rounding errors: to the picometre."""
     x, y, z = (round(value, 9) + 0.0 for value in point)
     return (x, y, z)
+
+
+def home_at_endstops(machine: Kinematics, positions: tuple[float, ...], first: SectionReader) -> Point:
+    """Return where the head is with the towers or arms at POSITIONS, their endstops.
+
+    Raises ConfigError, at the section of the FIRST one, when the rods do not meet there.
+    """
+    try:
+        return tidy(machine.forward(positions))
+    except (ValueError, ZeroDivisionError):
+        sentence = (
+            f"the rods of [{first.name}] and the others do not meet when all are at their endstops; correct"
+            " position_endstop, or the lengths"
+        )
+        raise ConfigError(first.place, sentence) from None
 
 
 def home_of(rail: RailDescription) -> float:

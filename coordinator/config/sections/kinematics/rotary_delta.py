@@ -5,7 +5,7 @@ import math
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
 from coordinator.config.sections.bounds import length_option
 from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
-from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, tidy
+from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, home_at_endstops
 from coordinator.config.sections.kinematics.towers import (
     MINIMUM_Z,
     ROUND_RANGE_OPTIONS,
@@ -73,7 +73,7 @@ def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
     for reader, end, function in zip(readers, ends, machine.step_functions(), strict=True):
         homing = read_tower_homing(reader, end, reading.pins)
         rails.append(read_tower(reading, reader, reader.name[-1], function, homing))
-    home = tidy(machine.forward(machine.endstop_positions))
+    home = home_at_endstops(machine, machine.endstop_positions, readers[0])
     return Frame(machine, tuple(rails), home, range_options=ROUND_RANGE_OPTIONS)
 
 

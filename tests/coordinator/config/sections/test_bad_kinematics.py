@@ -109,6 +109,18 @@ BAD: dict[str, tuple[str, str, str, str]] = {
         "gear_ratio: 80:16\nrotation_distance: 40\n",
         "[stepper_bed] has no option 'rotation_distance'; remove it or correct its name",
     ),
+    "endstops too far apart": (
+        "delta",
+        "[stepper_b]\n",
+        "[stepper_b]\nposition_endstop: 90000\n",
+        "the rods of [stepper_a] and the others do not meet when all are at their endstops; correct",
+    ),
+    "endstops of a deltesian too far apart": (
+        "deltesian",
+        "[stepper_right]\n",
+        "[stepper_right]\nposition_endstop: 90000\n",
+        "the rods of [stepper_left] and the others do not meet when all are at their endstops; correct",
+    ),
     "arms out of reach": (
         "rotary_delta",
         "shoulder_height: 412.9",
