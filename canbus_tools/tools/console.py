@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import os
 import re
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
@@ -19,6 +18,7 @@ from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, integer, options_from, parse_int
 from nodes.support.terminal import show
+from nodes.support.user_folder import user_folder
 from nodes.transport import BAUD_DEFAULT
 
 NODEID_MAX = 255
@@ -178,11 +178,8 @@ def _say(text: str) -> None:
 
 
 def _history_file() -> Path:
-    """Return the file of earlier lines (XDG_STATE_HOME)."""
-    base = os.environ.get("XDG_STATE_HOME", "")
-    # The XDG Base Directory Specification requires relative paths to be ignored.
-    root = Path(base) if os.path.isabs(base) else Path.home() / ".local" / "state"  # noqa: PTH117
-    return root / "canductor" / "console_history"
+    """Return the file of earlier lines (XDG_STATE_HOME); raises CanductorError."""
+    return user_folder("XDG_STATE_HOME", ".local", "state") / "canductor" / "console_history"
 
 
 # ------------------------------------------------------------------------------------------------- the node

@@ -16,6 +16,7 @@ A restart makes new modules: all state is in the object. Everything happens on t
 """
 
 from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from coordinator.config.errors import ConfigError, NotSupported, Place
@@ -183,6 +184,14 @@ class Build:
     def get_or(self, option: Option[T], default: T) -> T:
         """Return an option's value, or the DEFAULT that the section computes; raises ConfigError."""
         return self.reader.get_or(option, default)
+
+    def path(self, option: Option[str]) -> Path:
+        """Return the path in an option, from the configuration's folder, ``~`` a home; raises ConfigError."""
+        text = self.get(option)
+        try:
+            return Path(self.place.path).parent / Path(text).expanduser()
+        except RuntimeError:
+            raise self.reader.bad(option, "but there is no such home folder; write the whole path") from None
 
     def pin(self, option: PinOption) -> PinDescription:
         """Take the pin that a required option names; raises ConfigError."""

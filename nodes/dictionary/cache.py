@@ -19,6 +19,7 @@ from typing import Final
 
 from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, Dictionary
 from nodes.dictionary.parts import DictionaryError
+from nodes.support.user_folder import user_folder
 
 MAX_FILES: Final = 64
 """Most files on disk; the least recently used are dropped."""
@@ -60,11 +61,8 @@ class DictionaryCache:
 
     @classmethod
     def of_user(cls) -> "DictionaryCache":
-        """Return the cache in the user's own cache folder (XDG_CACHE_HOME)."""
-        base = os.environ.get("XDG_CACHE_HOME", "")
-        # The XDG Base Directory Specification requires that a relative path is ignored.
-        root = Path(base) if os.path.isabs(base) else Path.home() / ".cache"  # noqa: PTH117
-        return cls(root / "canductor" / "dictionaries")
+        """Return the cache in the user's own cache folder (XDG_CACHE_HOME); raises CanductorError."""
+        return cls(user_folder("XDG_CACHE_HOME", ".cache") / "canductor" / "dictionaries")
 
     def candidates(self, beginning: bytes) -> list[CachedDictionary]:
         """Return all dictionaries whose compressed form begins like this, most recently used first."""

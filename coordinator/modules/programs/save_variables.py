@@ -36,8 +36,7 @@ class SaveVariables(Module):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        name = Path(build.get(FILENAME)).expanduser()
-        self.path = Path(build.place.path).parent / name
+        self.path = build.path(FILENAME)
         self._place = build.reader.place_of(FILENAME)
         self._variables: dict[str, Any] = {}
         self._shown: dict[str, Value] = {}

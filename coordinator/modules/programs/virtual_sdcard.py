@@ -1,7 +1,6 @@
 """[virtual_sdcard]: the job folder as a memory card: SDCARD_PRINT_FILE, M20 to M27."""
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Final
 
 from coordinator.config.options import GCodeOption, SectionSpec, TextOption
@@ -40,7 +39,7 @@ class VirtualSdcard(Module):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self.path = Path(build.place.path).parent / Path(build.get(PATH)).expanduser()
+        self.path = build.path(PATH)
         self.on_error = GCodeTemplate(build, ON_ERROR)
         self.acts_on_error = bool(build.get(ON_ERROR).strip())
         self.files: Callable[[], Sequence[tuple[str, int]]] = tuple

@@ -2,6 +2,7 @@
 
 from coordinator.config.model import NO_ENDSTOP
 from coordinator.config.options import SectionReader, SectionSpec
+from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, axis_range, home_of
 from coordinator.config.sections.rails import POSITION_MAX, read_rail, read_tower
 from coordinator.config.sections.reading import Reading
@@ -29,9 +30,10 @@ def read_polar(reading: Reading, _printer: SectionReader) -> Frame:
     bed = read_tower(reading, SectionReader(section, BED), "bed", turn, NO_ENDSTOP)
     arm, z = read_rail(reading, "arm", radius), read_rail(reading, "z", up)
     low, high = axis_range(arm)
-    if high <= 0:
+    if not 0 < high <= MAX_POSITION:
         option = reading.config.sections["stepper_arm"]
-        raise SectionReader(option, SectionSpec("", ())).bad(POSITION_MAX, "must be above 0")
+        rule = f"must be above 0 and at most {MAX_POSITION:.15g}"
+        raise SectionReader(option, SectionSpec("", ()), whole=False).bad(POSITION_MAX, rule)
     home = (home_of(arm), 0.0, home_of(z))
     return Frame(Polar((low, high), axis_range(z)), (bed, arm, z), home, range_options=RANGE_OPTIONS)
 

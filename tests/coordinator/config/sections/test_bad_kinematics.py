@@ -109,6 +109,12 @@ BAD: dict[str, tuple[str, str, str, str]] = {
         "gear_ratio: 80:16\nrotation_distance: 40\n",
         "[stepper_bed] has no option 'rotation_distance'; remove it or correct its name",
     ),
+    "an arm without end": (
+        "polar",
+        "position_endstop: 150\nposition_min: 5\nposition_max: 150",
+        "position_endstop: 5\nposition_min: 5\nposition_max: 1e9",
+        "option 'position_max' of [stepper_arm] is '1e9', must be above 0 and at most 100000",
+    ),
     "endstops too far apart": (
         "delta",
         "[stepper_b]\n",

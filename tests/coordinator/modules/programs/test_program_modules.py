@@ -130,6 +130,15 @@ def test_a_plan_keeps_variables_to_itself(tmp_path: Path) -> None:
     assert read_variables(tmp_path / "kept.cfg")["x"] == 1.5
 
 
+@pytest.mark.parametrize(("section", "option"), [("save_variables", "filename"), ("virtual_sdcard", "path")])
+def test_a_path_below_a_home_that_does_not_exist(tmp_path: Path, section: str, option: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        ProgramStage(tmp_path, f"\n[{section}]\n{option}: ~nosuchuser/x\n")
+    assert f"option '{option}' of [{section}] is '~nosuchuser/x', but there is no such home" in str(
+        error.value
+    )
+
+
 @pytest.mark.parametrize(
     ("line", "part"),
     [
