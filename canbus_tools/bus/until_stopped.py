@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a flag, for tools that have something to bring to its end."""
+"""Ctrl-C, SIGTERM and SIGHUP as a flag, for tools that have something to bring to its end."""
 
 import contextlib
 import signal
@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Final
 
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+ENDING: Final = (signal.SIGTERM, signal.SIGHUP)
+"""End a program as Ctrl-C does; SIGHUP: its terminal is gone."""
+_SIGNALS: Final = (signal.SIGINT, *ENDING)
 
 
 class StopFlag:
@@ -18,7 +20,7 @@ class StopFlag:
 
 @contextlib.contextmanager
 def stop_flag() -> Iterator[StopFlag]:
-    """Give a flag that Ctrl-C and SIGTERM set while this lasts; main thread. A second one ends at once."""
+    """Give a flag that these signals set while this lasts; main thread. A second one ends at once."""
     flag = StopFlag()
     before = {number: signal.getsignal(number) for number in _SIGNALS}
 

@@ -14,6 +14,7 @@ from textual.containers import Vertical
 from textual.widgets import DataTable, Footer, Input, RichLog, Static
 
 from canbus_tools.bus.computer import Computer, Listener, now_s
+from canbus_tools.bus.until_stopped import ENDING
 from canbus_tools.monitor.bus_watch import BusRates, BusWatch, MonitorOptions
 from canbus_tools.monitor.text import COLUMNS, bar_line, cells, log_line
 from canbus_tools.protocol.decoded import Decoded, Kind
@@ -59,8 +60,8 @@ class MonitorScreen(App[None]):
     def __init__(self, computer: Computer, options: MonitorOptions, watch: BusWatch, queue: Listener) -> None:
         super().__init__()
         self.failure: CanductorError | None = None
-        self.terminated = False
-        """Whether SIGTERM was received."""
+        self.ended_by: signal.Signals | None = None
+        """SIGTERM or SIGHUP, if that was received."""
         self.shown = 0
         """Number of lines written to the log."""
         self._computer = computer
@@ -95,11 +96,13 @@ class MonitorScreen(App[None]):
         log.can_focus = True
         log.focus()
         self.set_interval(REFRESH_S, self.refresh_now)
-        # The command line's handler would end the program before the terminal is restored.
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._terminate)
+        # The command line's handlers would end the program before the terminal is restored.
+        for number in ENDING:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                asyncio.get_running_loop().add_signal_handler(number, self._end_by, number)
 
-    def _terminate(self) -> None:
-        self.terminated = True
+    def _end_by(self, number: signal.Signals) -> None:
+        self.ended_by = number
         self.exit()
 
     def on_resize(self, event: events.Resize) -> None:

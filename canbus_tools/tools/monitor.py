@@ -11,7 +11,7 @@ from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.bus.computer import Computer, Listener, now_s
 from canbus_tools.bus.open_bus import BITRATE_MAX, BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import BusTalk, refuse_if_in_use
-from canbus_tools.bus.until_stopped import StopFlag, stop_flag
+from canbus_tools.bus.until_stopped import ENDING, StopFlag, stop_flag
 from canbus_tools.discovery.inventory import take_inventory
 from canbus_tools.monitor.bus_watch import BusWatch, MonitorOptions
 from canbus_tools.monitor.screen import MonitorScreen
@@ -98,11 +98,12 @@ def run_monitor(computer: Computer, options: MonitorOptions) -> "MonitorReport":
 
 
 def _run_screen(screen: MonitorScreen) -> int:
-    before = signal.getsignal(signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in ENDING}
     screen.run()
-    signal.signal(signal.SIGTERM, before)
-    if screen.terminated:
-        signal.raise_signal(signal.SIGTERM)
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    if screen.ended_by is not None:
+        signal.raise_signal(screen.ended_by)
     if screen.failure is not None:
         raise screen.failure
     return screen.shown
@@ -143,7 +144,7 @@ class Lines:
         self._reported: set[str] = set()
 
     def run(self) -> int:
-        """Write until the duration is over, Ctrl-C or SIGTERM; returns the number of lines.
+        """Write until the duration is over, Ctrl-C, SIGTERM or SIGHUP; returns the number of lines.
 
         Signals end it between two lines, so that every line written is counted.
         """

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from coordinator.cli.parser import Job, build_parser, parse_command_line
 from coordinator.support.bug_log import log_bug
-from coordinator.support.interrupts import Terminated
+from coordinator.support.interrupts import TERMINATION, Terminated
 from coordinator.support.report import Report
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import ParserExit, UsageError
@@ -23,9 +23,9 @@ EXIT_OK = 0
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_BUG = 70
-EXIT_INTERRUPTED = 130
+EXIT_SIGNAL = 128
+"""Added to the number of a signal, as shells do."""
 EXIT_BROKEN_PIPE = 141
-EXIT_TERMINATED = 143
 
 
 def main(
@@ -37,7 +37,7 @@ def main(
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     as_json = "--json" in words
-    before = signal.signal(signal.SIGTERM, _terminate)
+    before = {number: signal.signal(number, _terminate) for number in _to_be_handled()}
     try:
         status = _run(words, as_json, parse) if words else _print_help()
         sys.stdout.flush()
@@ -47,12 +47,18 @@ def main(
         _drop_stdout()
         return EXIT_BROKEN_PIPE
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return status
 
 
-def _terminate(*_: object) -> None:
-    raise Terminated
+def _to_be_handled() -> list[signal.Signals]:
+    """Return which signals of TERMINATION end the command: SIGHUP not where nohup has it ignored."""
+    return [n for n in TERMINATION if n == signal.SIGTERM or signal.getsignal(n) is not signal.SIG_IGN]
+
+
+def _terminate(number: int, _: object) -> None:
+    raise Terminated(number)
 
 
 def _print_help() -> int:
@@ -71,12 +77,9 @@ def _run(words: list[str], as_json: bool, parse: Callable[[Sequence[str]], Job])
         sentence = " ".join(str(error).split())
         return _fail(f"{sentence} (see '{error.command or 'canductor'} --help')", EXIT_USAGE, as_json)
     except KeyboardInterrupt as error:
-        terminated = isinstance(error, Terminated)
-        return _fail(
-            "stopped by SIGTERM" if terminated else "stopped by Ctrl-C",
-            EXIT_TERMINATED if terminated else EXIT_INTERRUPTED,
-            as_json,
-        )
+        number = error.signal if isinstance(error, Terminated) else signal.SIGINT
+        name = "Ctrl-C" if number == signal.SIGINT else number.name
+        return _fail(f"stopped by {name}", EXIT_SIGNAL + number, as_json)
     except BrokenPipeError:
         raise
     except Exception as bug:  # noqa: BLE001 (the last line of defence: whatever arrives here is reported as a bug)

@@ -135,7 +135,8 @@ def run_all(tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
 
 
 def _begin_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself handles Ctrl-C and ends the pool
+    for number in (signal.SIGINT, signal.SIGHUP):  # the command itself handles them and ends the pool
+        signal.signal(number, signal.SIG_IGN)
 
 
 def run_one(scenario: Scenario, seed: int, limit_s: float = SEED_LIMIT_S) -> Result:

@@ -1,23 +1,31 @@
-"""Ctrl-C and SIGTERM as the cancellation of a job, never as an exception out of the blue."""
+"""Ctrl-C, SIGTERM and SIGHUP as the cancellation of a job, never as an exception out of the blue."""
 
 import asyncio
 import signal
 from collections.abc import Callable, Coroutine
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 T = TypeVar("T")
 
 
+TERMINATION: Final = (signal.SIGTERM, signal.SIGHUP)
+"""Signals that end a command as Ctrl-C does; SIGHUP: its terminal is gone."""
+
+
 class Terminated(KeyboardInterrupt):
-    """SIGTERM ended a command, as Ctrl-C does."""
+    """NUMBER, one of TERMINATION, ended a command, as Ctrl-C does."""
+
+    def __init__(self, number: int = signal.SIGTERM) -> None:
+        super().__init__()
+        self.signal: Final = signal.Signals(number)
 
 
 def run_to_end(
     job: Callable[[], Coroutine[Any, Any, T]],
     make_loop: Callable[[], asyncio.AbstractEventLoop] = asyncio.new_event_loop,
 ) -> T:
-    """Run JOB in a loop of its own; the first Ctrl-C or SIGTERM cancels it, further ones change nothing.
+    """Run JOB in a loop of its own; the first Ctrl-C, SIGTERM or SIGHUP cancels it, others change nothing.
 
     When it has ended, KeyboardInterrupt or Terminated is raised for the signal.
     """
@@ -40,13 +48,14 @@ class _Interrupts:
 
     def __init__(self) -> None:
         self.received: list[int] = []
-        numbers = (signal.SIGINT, signal.SIGTERM)
-        # Ctrl-C is ignored by what a shell runs in the background, and shall be.
+        numbers = (signal.SIGINT, *TERMINATION)
+        # Ctrl-C is ignored by what a shell runs in the background, SIGHUP by what nohup does, and shall be.
         self._numbers = [n for n in numbers if signal.getsignal(n) is not signal.SIG_IGN]
 
     def exception(self) -> KeyboardInterrupt:
         """Return what to raise for the first signal."""
-        return Terminated() if self.received[0] == signal.SIGTERM else KeyboardInterrupt()
+        first = self.received[0]
+        return Terminated(first) if first in TERMINATION else KeyboardInterrupt()
 
     def __enter__(self) -> Self:
         self._handlers = {number: signal.signal(number, self._note) for number in self._numbers}

@@ -16,7 +16,8 @@ from tests.stages.can_stage import CanStage
 
 
 @pytest.mark.parametrize(
-    ("number", "status", "name"), [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")]
+    ("number", "status", "name"),
+    [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM"), (signal.SIGHUP, 129, "SIGHUP")],
 )
 def test_a_signal_ends_a_tool_in_order(
     stage: CanStage, can_tool: Command, number: signal.Signals, status: int, name: str

@@ -186,9 +186,10 @@ def test_a_bus_that_ends_in_mid_print_stops_the_node_on_another(tmp_path: Path) 
     [
         (signal.SIGINT, 1, KeyboardInterrupt),
         (signal.SIGTERM, 1, Terminated),
+        (signal.SIGHUP, 1, Terminated),
         (signal.SIGINT, 3, KeyboardInterrupt),
     ],
-    ids=["Ctrl-C", "SIGTERM", "Ctrl-C three times"],
+    ids=["Ctrl-C", "SIGTERM", "SIGHUP", "Ctrl-C three times"],
 )
 def test_a_print_ended_by_the_user_leaves_all_nodes_shut_down(
     tmp_path: Path, number: signal.Signals, times: int, exception: type[BaseException]

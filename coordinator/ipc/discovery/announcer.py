@@ -27,6 +27,7 @@ from coordinator.ipc.discovery.multicast import (
     open_mdns,
     reachable_addresses,
 )
+from coordinator.support.interrupts import TERMINATION
 from nodes.support.errors import CanductorError
 from nodes.support.terminal import show
 
@@ -183,7 +184,7 @@ def _print(sentence: str) -> None:
 
 
 if __name__ == "__main__":
-    # Ctrl-C and a service manager's SIGTERM reach the parent, too, and end this when that is done.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    # Ctrl-C, SIGHUP and a service manager's SIGTERM reach the parent, too, and end this when that is done.
+    for number in (signal.SIGINT, *TERMINATION):
+        signal.signal(number, signal.SIG_IGN)
     asyncio.run(_main())

@@ -32,7 +32,7 @@ DICTIONARY = f"{MAIN_ID}={firmware_path(MAINBOARD).with_suffix('.json')}"
 Captured = pytest.CaptureFixture[str]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_lines_learn_the_dictionary_and_end_in_order(
     stage: CanStage, can_tool: Command, number: signal.Signals
 ) -> None:

@@ -1,9 +1,11 @@
 """The command line: words become options, every end is one sentence, with --json one object."""
 
 import argparse
+import asyncio
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -18,6 +20,7 @@ from coordinator.cli.parser import build_parser
 from coordinator.demo.run import DemoOptions
 from coordinator.planning.options import PlanOptions
 from coordinator.support.examples import DEMO_MACHINE
+from coordinator.support.interrupts import run_to_end
 from nodes.support.errors import CanductorError
 
 
@@ -162,6 +165,41 @@ def test_failures_end_in_one_sentence(
     out, err = capsys.readouterr()
     assert err == f"canductor: {sentence}\n"
     assert json.loads(out.splitlines()[-1]) == {"ok": False, "error": sentence}
+
+
+@pytest.fixture
+def hangup() -> Iterator[None]:
+    """Leave SIGHUP as it was."""
+    before = signal.getsignal(signal.SIGHUP)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("hangup")
+@pytest.mark.parametrize("on_loop", [False, True], ids=["as it calculates", "on a loop"])
+def test_a_terminal_that_is_closed_ends_a_command_but_not_under_nohup(
+    runners: Runners, files: Path, capsys: pytest.CaptureFixture[str], *, on_loop: bool
+) -> None:
+    """It ended at once, without a sentence, and its sockets remained."""
+
+    async def close_and_wait() -> PlainReport:
+        signal.raise_signal(signal.SIGHUP)
+        for _ in range(3):
+            await asyncio.sleep(0)
+        return PlainReport()
+
+    def close() -> PlainReport:
+        signal.raise_signal(signal.SIGHUP)
+        return PlainReport()
+
+    runners.answer = (lambda: run_to_end(close_and_wait)) if on_loop else close
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert cli.main(["run", "my.cfg"]) == 0
+    capsys.readouterr()
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    assert cli.main(["run", "my.cfg"]) == 129
+    assert capsys.readouterr() == ("", "canductor: stopped by SIGHUP\n")
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("by\nzero"), BrokenPipeError("a node's socket")])
