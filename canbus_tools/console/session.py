@@ -58,6 +58,8 @@ class Session:
         self.messages = 0
         """Shown."""
         self._say = say
+        self._unsaid: OSError | None = None
+        """Why a message could not be shown; raised by ``run``, as nobody catches it where messages come."""
         self._as_json = as_json
         self._shapes: dict[str, MessageShape] = {}
         self._hidden: set[str] = set()
@@ -78,10 +80,12 @@ class Session:
         return sorted({"clock", *self.names})
 
     async def run(self, text: str) -> None:
-        """Carry out one line; raises CanductorError, and Quit."""
+        """Carry out one line; raises CanductorError, Quit, and OSError when output cannot be written."""
         command = read_line(text)
         if command is not None:
             await self._run(command)
+        if self._unsaid is not None:
+            raise self._unsaid
 
     async def _run(self, command: Command) -> None:
         if isinstance(command, OwnCommand):
@@ -110,6 +114,12 @@ class Session:
         if unasked:
             return
         self.messages += 1
+        try:
+            self._show_message(message, received_ns)
+        except OSError as error:
+            self._unsaid = error
+
+    def _show_message(self, message: Message, received_ns: int) -> None:
         text = self._text(message)
         if not self._as_json:
             self._say(text)

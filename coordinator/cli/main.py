@@ -5,7 +5,6 @@ one place: one sentence on stderr, with --json also one object on stdout.
 """
 
 import json
-import os
 import select
 import signal
 import sys
@@ -17,7 +16,7 @@ from coordinator.support.interrupts import TERMINATION, Terminated
 from coordinator.support.report import Report
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import ParserExit, UsageError
-from nodes.support.terminal import show, show_error
+from nodes.support.terminal import OutputError, discard, replace_closed_outputs, show, show_error
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -37,19 +36,18 @@ def main(
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     as_json = "--json" in words
+    replace_closed_outputs()
     before = {number: signal.signal(number, _terminate) for number in _to_be_handled()}
     try:
-        status = _run(words, as_json, parse) if words else _print_help()
-        sys.stdout.flush()
+        return _run(words, as_json, parse)
     except BrokenPipeError as error:
         if not _stdout_is_gone():
             return _fail(log_bug(error), EXIT_BUG, as_json)
-        _drop_stdout()
+        discard(sys.stdout)
         return EXIT_BROKEN_PIPE
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-    return status
 
 
 def _to_be_handled() -> list[signal.Signals]:
@@ -68,10 +66,10 @@ def _print_help() -> int:
 
 def _run(words: list[str], as_json: bool, parse: Callable[[Sequence[str]], Job]) -> int:
     try:
-        return _show(parse(words)(), as_json)
+        return _show(parse(words)(), as_json) if words else _print_help()
     except ParserExit:
         return EXIT_OK
-    except CanductorError as error:
+    except (CanductorError, OutputError) as error:
         return _fail(str(error), EXIT_FAILED, as_json)
     except UsageError as error:
         sentence = " ".join(str(error).split())
@@ -97,7 +95,10 @@ def _show(report: Report, as_json: bool) -> int:
 def _fail(sentence: str, status: int, as_json: bool) -> int:
     show_error(f"canductor: {sentence}")
     if as_json:
-        _show_json({"ok": False, "error": sentence})
+        try:
+            _show_json({"ok": False, "error": sentence})
+        except OutputError as error:
+            show_error(f"canductor: {error}")
     return status
 
 
@@ -113,13 +114,6 @@ def _stdout_is_gone() -> bool:
         return any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0))
     except (OSError, ValueError):  # not a file: nobody can close its other end
         return False
-
-
-def _drop_stdout() -> None:
-    """Discard what is still buffered, or the interpreter complains when it exits."""
-    devnull = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(devnull, sys.stdout.fileno())
-    os.close(devnull)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Self, TextIO
 if TYPE_CHECKING:
     from coordinator.support.progress_live import LiveProgress
 
-from nodes.support.terminal import printable, show
+from nodes.support.terminal import printable, show_error
 
 LIVE_INTERVAL_S = 0.2
 PLAIN_INTERVAL_S = 5.0
@@ -136,4 +136,4 @@ class ProgressDisplay:
         if self._live is not None:
             self._live.show(progress)
         elif not self._is_live:
-            show(f"{self._title}: {summary(progress)}", self._stderr)
+            show_error(f"{self._title}: {summary(progress)}", self._stderr)

@@ -14,6 +14,7 @@ from typing import Any, NoReturn, TypeVar
 
 from nodes.support.errors import CanductorError
 from nodes.support.numbers import read_decimal, read_int
+from nodes.support.terminal import show
 
 T = TypeVar("T")
 
@@ -58,6 +59,9 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise UsageError."""
         raise UsageError(message)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        show(message, file, end="")
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """End after --help or --version."""

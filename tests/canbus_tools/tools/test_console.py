@@ -106,6 +106,17 @@ def test_what_comes_unasked_is_shown(on_4: OnNode) -> None:
     assert "is_shutdown=1" in said.out
 
 
+def test_a_full_disk_is_not_the_nodes_silence(on_4: OnNode, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What failed where messages come gave a traceback for each, and the node "did not answer"."""
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        said = on_4("get_canbus_id", "get_config")
+    assert (said.status, said.err) == (
+        1,
+        "canductor: cannot write the output: no space left on device\n",
+    )
+
+
 def test_an_error_ends_a_script_with_its_line(node: CanStage, can_tool: Command, tmp_path: Path) -> None:
     del node
     script = tmp_path / "bad"

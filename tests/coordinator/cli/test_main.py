@@ -326,6 +326,43 @@ def test_a_closed_reader_is_no_error(tmp_path: Path) -> None:
     assert done.returncode == cli.EXIT_BROKEN_PIPE
 
 
+THAT_SAY_SOMETHING = ["--version", "", "config reference", "completion bash", "config check no.cfg --json"]
+
+
+def shell(command: str, words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run COMMAND of a shell, in which $canductor stands for the command with WORDS."""
+    script = command.replace("$canductor", f"{sys.executable} -m coordinator.cli.main {words}")
+    environment = {**os.environ, "TMPDIR": str(folder)}
+    return subprocess.run(
+        ["/bin/sh", "-c", script], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+@pytest.mark.parametrize("words", THAT_SAY_SOMETHING)
+def test_without_standard_output_a_command_does_what_it_does(tmp_path: Path, words: str) -> None:
+    closed = shell("$canductor >&-", words, tmp_path)
+    usual = shell("$canductor", words, tmp_path)
+    assert (closed.stdout, closed.stderr) == ("", usual.stderr)
+    assert closed.returncode == usual.returncode
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", THAT_SAY_SOMETHING)
+def test_output_to_a_full_disk_is_a_failure(tmp_path: Path, words: str) -> None:
+    done = shell("$canductor >/dev/full", words, tmp_path)
+    last = done.stderr.splitlines()[-1]
+    assert last == "canductor: cannot write the output: no space left on device"
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("where", ["2>&-", "2>/dev/full"])
+def test_a_sentence_that_nobody_takes_goes_nowhere_else(tmp_path: Path, where: str) -> None:
+    done = shell(f"$canductor {where}", "config check no.cfg", tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
