@@ -3,7 +3,6 @@
 The readable frames of a damaged or truncated file are yielded; then a CanductorError reports the place.
 """
 
-import sys
 from collections.abc import Callable, Iterator
 from io import BufferedReader, TextIOWrapper
 from pathlib import Path
@@ -16,6 +15,7 @@ from canbus_tools.recordings import mcap_file, pcap
 from canbus_tools.recordings.candump import read_candump
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import existing_file
+from nodes.support.standard_input import standard_input
 
 STANDARD_INPUT: Final = Path("-")
 BATCH: Final = 512
@@ -41,7 +41,7 @@ def read_batches(path: Path, before_read: Callable[[], object] | None = None) ->
     BEFORE_READ is called before each read of a log.
     """
     if path == STANDARD_INPUT:
-        yield from read_candump(sys.stdin.buffer, "standard input", before_read)
+        yield from read_candump(standard_input().buffer, "standard input", before_read)
         return
     existing_file(path)
     try:

@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import re
-import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from canbus_tools.discovery.inventory import take_inventory
 from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, integer, options_from, parse_int
+from nodes.support.standard_input import standard_input
 from nodes.support.terminal import show
 from nodes.support.user_folder import user_folder
 from nodes.transport import BAUD_DEFAULT
@@ -132,7 +132,7 @@ async def _run(computer: Computer, options: ConsoleOptions) -> ConsoleReport:
     async with _open(computer, options) as talk:
         session = Session(talk, _say, as_json=options.as_json)
         try:
-            if options.commands or options.script or not sys.stdin.isatty():
+            if options.commands or options.script or not standard_input().isatty():
                 await _run_lines(session, options)
             else:
                 await prompt(session, _history_file())
@@ -161,7 +161,7 @@ def _lines(options: ConsoleOptions) -> Iterator[tuple[str, str]]:
     name = str(options.script) if options.script else "standard input"
     with contextlib.ExitStack() as stack:
         if options.script is None:
-            lines: Iterator[str] = iter(sys.stdin)
+            lines: Iterator[str] = iter(standard_input())
         else:
             lines = stack.enter_context(options.script.open(encoding="utf-8"))
         try:

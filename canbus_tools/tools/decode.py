@@ -3,7 +3,6 @@
 import argparse
 import re
 import select
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file
+from nodes.support.standard_input import standard_input
 from nodes.support.terminal import show, show_error
 
 LINES_HELD: Final = 500
@@ -153,7 +153,7 @@ class Decoding:
     def _wait_for_input(self) -> None:
         """Write the lines so far, and wait for input; Ctrl-C ends only the waiting."""
         self._write()
-        while not (self._flag.stopped or _readable(sys.stdin.buffer)):
+        while not (self._flag.stopped or _readable(standard_input().buffer)):
             pass
         if self._flag.stopped:
             raise _StoppedError
@@ -264,6 +264,5 @@ class DecodeReport:
 
     @staticmethod
     def _warn(sentences: list[str]) -> None:
-        sys.stdout.flush()
         for sentence in sentences:
             show_error(f"canductor: {sentence}")

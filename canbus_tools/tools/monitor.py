@@ -73,7 +73,7 @@ def make_job(given: argparse.Namespace) -> "Callable[[Computer], MonitorReport]"
         lines=given.lines or given.json or not sys.stdout.isatty(),
         as_json=given.json,
     )
-    if not options.lines and not sys.stdin.isatty():
+    if not options.lines and not (sys.stdin is not None and sys.stdin.isatty()):
         raise UsageError("the screen needs a keyboard, but standard input is not a terminal; give --lines")
     return lambda computer: run_monitor(computer, options)
 

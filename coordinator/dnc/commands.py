@@ -1,7 +1,6 @@
 """The commands of ``canductor dnc``."""
 
 import contextlib
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.client.upload import send_program, show_progress
 from coordinator.support.report import PlainReport, Report
 from nodes.support.errors import CanductorError
+from nodes.support.standard_input import standard_input
 from nodes.support.terminal import show_error
 
 POLL_PERIOD_S: Final = 0.02
@@ -269,7 +269,7 @@ def drip(job: DncJob, around: Environment = THIS_COMPUTER) -> Report:
 def _open_stream(file: Path, stack: contextlib.ExitStack, around: Environment) -> IO[bytes]:
     if str(file) != "-":
         return stack.enter_context(_open(file))
-    return sys.stdin.buffer if around.typed is None else around.typed
+    return standard_input().buffer if around.typed is None else around.typed
 
 
 def _drip_to_machine(job: DncJob, around: Environment) -> Report:

@@ -3,7 +3,6 @@
 import os
 import select
 import stat
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from io import FileIO
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Protocol, Self
 
 from coordinator.gcode.errors import GCodeError
 from nodes.support.errors import CanductorError
+from nodes.support.standard_input import standard_input
 
 CHUNK_BYTES = 1 << 16
 MAX_LINE_BYTES = 1 << 20
@@ -122,7 +122,7 @@ class Program:
         """Open the file PATH, or standard input for ``-``. Raises CanductorError when that fails."""
         if str(path) == "-":
             # Unbuffered: what a person or a program typed is acted on at once, not when a block is full.
-            return cls(FileIO(sys.stdin.fileno(), closefd=False), "standard input")
+            return cls(FileIO(standard_input().fileno(), closefd=False), "standard input")
         try:
             source = UnchangedFile(path, str(path))
             size = source.status.st_size if stat.S_ISREG(source.status.st_mode) else None
@@ -133,8 +133,8 @@ class Program:
 
     @classmethod
     def typed(cls) -> Self:
-        """Read standard input as it comes, without ever waiting for it."""
-        return cls(_Typed(sys.stdin.fileno()), "standard input")
+        """Read standard input as it comes, without ever waiting for it; raises CanductorError."""
+        return cls(_Typed(standard_input().fileno()), "standard input")
 
     @classmethod
     def from_lines(cls, lines: Iterable[str | bytes], name: str = "program") -> Self:

@@ -117,6 +117,14 @@ def test_a_full_disk_is_not_the_nodes_silence(on_4: OnNode, monkeypatch: pytest.
     )
 
 
+def test_without_standard_input_and_commands_there_is_nothing_to_do(
+    on_4: OnNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    assert on_4().err == "canductor: standard input is closed, so there is nothing to read; name a file\n"
+    assert on_4("get_canbus_id").status == 0
+
+
 def test_an_error_ends_a_script_with_its_line(node: CanStage, can_tool: Command, tmp_path: Path) -> None:
     del node
     script = tmp_path / "bad"

@@ -363,6 +363,13 @@ def test_a_sentence_that_nobody_takes_goes_nowhere_else(tmp_path: Path, where: s
     assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
 
 
+@pytest.mark.parametrize("words", ["run {0}", "plan {0} -", "can decode -"])
+def test_without_standard_input_there_is_nothing_to_read(tmp_path: Path, words: str) -> None:
+    done = shell("$canductor <&-", words.format(DEMO_MACHINE), tmp_path)
+    assert done.stderr == "canductor: standard input is closed, so there is nothing to read; name a file\n"
+    assert done.returncode == 1
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
