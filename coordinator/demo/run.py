@@ -17,10 +17,12 @@ from coordinator.streaming.pipeline import PlanRecord
 from coordinator.support.examples import DEMO_GCODE, DEMO_MACHINE
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.progress import ProgressDisplay
+from coordinator.support.quoting import shown_path
 from coordinator.verification.hardware import Hardware
 from coordinator.verification.heat_proof import HeatWatch, not_steady, prove_heat
 from coordinator.verification.prover import Prover
 from coordinator.virtual_machine.virtual_machine import VirtualMachine, VirtualMachineOptions
+from nodes.support.errors import CanductorError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,8 +92,15 @@ def print_and_prove(
 
 @contextmanager
 def _folder(keep: Path | None) -> Iterator[Path]:
+    """Give the folder KEEP, else a temporary one; raises CanductorError."""
     if keep is not None:
-        keep.mkdir(parents=True, exist_ok=True)
+        try:
+            keep.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise CanductorError(
+                f"cannot keep the step logs in {shown_path(str(keep))}: {error.strerror}; name another folder"
+                " with --keep"
+            ) from None
         yield keep
         return
     with tempfile.TemporaryDirectory(prefix="canductor-demo-") as folder:
