@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from coordinator.config.model import ShaperDescription
 from coordinator.config.options import BadValue, FloatOption, Option, SectionReader, SectionSpec, one_of
 from coordinator.config.sections.reading import Reading
-from coordinator.motion.steps.shapers import SHAPER_KINDS, split_kind
+from coordinator.motion.steps.shapers import SHAPER_KINDS, check_reach, split_kind
 
 MAX_FREQUENCY_HZ = 1000.0
 AXES = "xyz"
@@ -79,6 +79,10 @@ def read_shapers(reading: Reading) -> tuple[ShaperDescription, ...]:
         if 0 < hz < MIN_FREQUENCY_HZ:
             raise reader.bad(frequency, f"must be 0 (not shaped) or at least {MIN_FREQUENCY_HZ:g} Hz")
         if hz:
+            try:
+                check_reach(own, hz, ratio)
+            except ValueError as problem:
+                raise reader.bad(frequency, f"is too low: {problem}") from None
             shapers.append(ShaperDescription(axis, own, hz, ratio, reader.place_of(frequency)))
     reading.finish(reader)
     return tuple(shapers)

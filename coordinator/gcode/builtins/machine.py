@@ -24,7 +24,7 @@ from coordinator.gcode.parameters import bounded, flag, needed
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.kinematics.dual_carriage import CarriageMode, CarriageState, DualCarriage
 from coordinator.motion.planner.planner import FeedStatus
-from coordinator.motion.steps.shapers import split_kind
+from coordinator.motion.steps.shapers import check_reach, split_kind
 from coordinator.motion.steps.surface import Surface
 
 MAX_FREQUENCY_HZ = 1000.0
@@ -282,11 +282,17 @@ def _shaper(command: Command, values: Mapping[str, str], axis: str, before: Shap
     damping = bounded(command, values, f"DAMPING_RATIO_{axis}", None, low=0, high=0.999)
     if frequency is not None and 0 < frequency < 1:
         raise WordError(f"SHAPER_FREQ_{axis} of {command.name} is {frequency:g}; give 0 or 1 Hz and more")
-    return Shaper(
+    after = Shaper(
         kind,
         before.frequency_hz if frequency is None else frequency,
         before.damping_ratio if damping is None else damping,
     )
+    if after.frequency_hz:
+        try:
+            check_reach(after.kind, after.frequency_hz, after.damping_ratio)
+        except ValueError as problem:
+            raise WordError(f"{command.name}: {problem}") from None
+    return after
 
 
 def _shown(axis: str, shaper: Shaper) -> str:

@@ -16,6 +16,8 @@ VIBRATION = 0.05
 """Share of the vibration that the ei shapers let through at their own frequency, unless their v_tol says."""
 TOLERANT_KINDS = ("ei", "2hump_ei", "3hump_ei")
 MAX_TOLERANCE = 0.5
+REACH_MAX_S = 1.0
+"""How far from a moment the impulses of a shaper may be; step_change.c refuses more."""
 _WRITTEN = re.compile(r"([a-z0-9_]+)(?:\( *v_tol *= *(\d+(?:\.\d*)?|\.\d+) *\))?", re.ASCII)
 
 
@@ -66,6 +68,16 @@ def shaper_impulses(written: str, frequency_hz: float, damping_ratio: float) -> 
     times = [i * spacing * period_s for i in range(len(amplitudes))]
     centre = math.fsum(a * t for a, t in zip(amplitudes, times, strict=True))
     return tuple((a, t - centre) for a, t in zip(amplitudes, times, strict=True))
+
+
+def check_reach(written: str, frequency_hz: float, damping_ratio: float) -> None:
+    """Raise ValueError, the end of a sentence, for a shaper that is too long; see ``shaper_impulses``."""
+    reach_s = max(abs(time_s) for _, time_s in shaper_impulses(written, frequency_hz, damping_ratio))
+    if reach_s > REACH_MAX_S:
+        raise ValueError(
+            f"{written} of {frequency_hz:g} Hz with a damping ratio of {damping_ratio:g} reaches {reach_s:.2f} s"
+            f" far, {REACH_MAX_S:g} s at most; give a higher frequency"
+        )
 
 
 def _undamped(kind: str, v: float) -> tuple[float, ...]:

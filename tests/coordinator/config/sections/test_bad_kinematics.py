@@ -235,6 +235,12 @@ BAD: dict[str, tuple[str, str, str, str]] = {
         "shaper_freq_x: 0.5",
         "option 'shaper_freq_x' of [input_shaper] is '0.5', must be 0 (not shaped) or at least 1 Hz",
     ),
+    "long shaper": (
+        "corexy",
+        "shaper_freq_x: 50",
+        "shaper_freq_x: 1\ndamping_ratio_x: 0.99",
+        "option 'shaper_freq_x' of [input_shaper] is '1', is too low: mzv of 1 Hz with a damping",
+    ),
     "unknown shaper": (
         "corexy",
         "shaper_type: mzv",

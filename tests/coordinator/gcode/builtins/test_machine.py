@@ -315,6 +315,10 @@ def test_another_way_per_turn_holds_from_a_standstill_on() -> None:
             ["SET_INPUT_SHAPER SHAPER_FREQ_X=0.1"],
             ":1: SHAPER_FREQ_X of SET_INPUT_SHAPER is 0.1; give 0 or",
         ),
+        (
+            ["SET_INPUT_SHAPER SHAPER_TYPE=3hump_ei SHAPER_FREQ_X=1 DAMPING_RATIO_X=0.1"],
+            ":1: SET_INPUT_SHAPER: 3hump_ei of 1 Hz with a damping ratio of 0.1 reaches 1.22 s far",
+        ),
         (["SET_INPUT_SHAPER DAMPING_RATIO_Z=1"], ":1: DAMPING_RATIO_Z of SET_INPUT_SHAPER is 1; 0 to 0.999"),
         (
             ["SYNC_EXTRUDER_MOTION EXTRUDER=nix MOTION_QUEUE="],
