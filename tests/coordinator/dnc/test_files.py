@@ -27,7 +27,7 @@ def names(path: Path) -> list[str]:
     [
         "", ".", "..", "../x", "a/b",
         "/etc/passwd", "a\\b", ".hidden", "-rf", "a\0b", "a\nb", "NUL", "nul.nc",
-        "CON", "com1.h", "LPT9", "a:b", "a*", "a?", "x.", "x ", " x", "ä", "x" * 101, "a|b", "\x7f",
+        "CON", "com1.h", "LPT9", "a:b", "a;b", "a*", "a?", "x.", "x ", " x", "ä", "x" * 101, "a|b", "\x7f",
     ],
 )  # fmt: skip
 def test_bad_names(name: str, tmp_path: Path) -> None:
