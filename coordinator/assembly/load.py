@@ -58,6 +58,11 @@ def load_machine(path: str) -> MachineDescription:
     return describe(parse_config(str(path)))
 
 
+def load_changed(path: str, data: bytes) -> MachineDescription:
+    """Do what ``load_machine`` does as if the file PATH held DATA; raises ConfigError."""
+    return describe(parse_config(path, data=data))
+
+
 def describe(config: ConfigFile) -> MachineDescription:
     """Return the machine that CONFIG speaks of; raises ConfigError for the first mistake found.
 
@@ -97,7 +102,7 @@ def describe(config: ConfigFile) -> MachineDescription:
         notes=(),
         axis_tables=axis_tables,
         probe=probe,
-        source=ConfigSource(config.path, config.data, saved_values(config)),
+        source=ConfigSource(config.path, config.data, saved_values(config), load_changed),
     )
     unsupported += [
         Unsupported(_section_of(stepper), stepper.place, ("enable_pin",), stepper.unpowered)

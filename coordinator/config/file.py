@@ -101,16 +101,23 @@ class ConfigFile:
     """Where mistakes are collected; None: the first one ends the reading."""
 
 
-def parse_config(path: str, problems: list[ConfigError] | None = None) -> ConfigFile:
+def parse_config(
+    path: str, problems: list[ConfigError] | None = None, *, data: bytes | None = None
+) -> ConfigFile:
     """Read a configuration file and all it includes; raises ConfigError.
 
     With PROBLEMS that is only raised for files that cannot be read: other mistakes are collected there.
+    DATA: what the file is going to hold, read instead of what it holds now.
     """
     config = ConfigFile(path, problems=problems)
     budget = ReadBudget()
     place = Place(path, 0)
     config_text.enter_file(path, place, budget)
-    config.data = config_text.read_bytes(path, place, budget)
+    if data is None:
+        data = config_text.read_bytes(path, place, budget)
+    else:
+        config_text.take_bytes(data, place, budget)
+    config.data = data
     lines = config_text.split_lines(config.data, path)
     header = saved_header(lines)
     _Parser(config, config.sections, budget).parse(path, enumerate(lines[:header], 1))

@@ -7,8 +7,8 @@ import codecs
 import os
 import re
 import stat
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -40,6 +40,8 @@ class ConfigSource:
     """All of it, without what it includes."""
     saved: Values
     """What its block says."""
+    load: Callable[[str, bytes], object]
+    """Loads the configuration as if the file, by its path, held other bytes; raises ConfigError."""
 
 
 class PendingConfig:
@@ -73,9 +75,10 @@ class PendingConfig:
         self._pending.pop(section, None)
 
     def write(self) -> str:
-        """Write all into the file and return its path; raises SaveError. It may take as long as a disk does.
+        """Write all into the file and return its path. Not for the control loop: it loads the configuration.
 
-        Nothing is pending afterwards, and what was written counts as read.
+        Nothing is pending afterwards, and what was written counts as read. Raises SaveError, also for values
+        that the next start would refuse.
         """
         source = self._source
         if source is None:
@@ -86,11 +89,23 @@ class PendingConfig:
         for section, options in self._pending.items():
             merged.setdefault(section, {}).update(options)
         data = with_block(source.data, merged)
+        _check_loads(source, data)
         replace_file(source.path, source.data, data)
-        self._source = ConfigSource(source.path, data, merged)
+        self._source = replace(source, data=data, saved=merged)
         self._pending = {}
         self._removed = set()
         return source.path
+
+
+def _check_loads(source: ConfigSource, data: bytes) -> None:
+    """Raise SaveError unless the machine of SOURCE can start with DATA as its file."""
+    try:
+        source.load(source.path, data)
+    except CanductorError as error:
+        raise SaveError(
+            f"nothing was saved, because the machine could not start with it: {error}; then calibrate again,"
+            " or drop what was calibrated with RESTART"
+        ) from None
 
 
 def with_block(data: bytes, values: Values) -> bytes:

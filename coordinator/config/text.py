@@ -51,8 +51,7 @@ def split_lines(data: bytes, path: str) -> list[str]:
 
 def read_bytes(path: str, place: Place, budget: ReadBudget) -> bytes:
     """Return what a regular file holds; raises ConfigError."""
-    budget.files -= 1
-    if budget.files < 0:
+    if budget.files < 1:
         raise ConfigError(place, f"more than {MAX_FILES} files are included")
     try:
         # Looked at before it is opened: opening a FIFO or a device may block or act.
@@ -63,10 +62,16 @@ def read_bytes(path: str, place: Place, budget: ReadBudget) -> bytes:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a valid path"
         raise ConfigError(place, f"cannot read {shown_path(path)}: {reason}") from None
+    take_bytes(data, place, budget)
+    return data
+
+
+def take_bytes(data: bytes, place: Place, budget: ReadBudget) -> None:
+    """Count DATA as one more file that was read; raises ConfigError where all is too large then."""
+    budget.files -= 1
     budget.bytes -= len(data)
     if budget.bytes < 0:
         raise ConfigError(place, f"the configuration is larger than {MAX_BYTES // 1_000_000} MB in all")
-    return data
 
 
 def enter_file(path: str, place: Place, budget: ReadBudget) -> None:

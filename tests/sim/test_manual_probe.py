@@ -50,6 +50,34 @@ def test_a_height_is_found_and_the_endstop_corrected(tmp_path: Path) -> None:
         runner.run(go())
 
 
+@pytest.mark.parametrize(
+    ("script", "outside"),
+    [
+        ("SET_GCODE_OFFSET Z=1.6\nZ_OFFSET_APPLY_ENDSTOP", "-1.100"),
+        ("G1 Z2 F600\nZ_ENDSTOP_CALIBRATE\nACCEPT", "-1.500"),
+        ("SET_GCODE_OFFSET Z=-250\nZ_OFFSET_APPLY_ENDSTOP", "250.500"),
+    ],
+)
+def test_an_endstop_outside_the_axis_is_not_kept(tmp_path: Path, script: str, outside: str) -> None:
+    """It was saved, and no start accepted it any more."""
+    path = tmp_path / "probe.cfg"
+    z = "rotation_distance: 8\nposition_endstop: 0"
+    path.write_text(MACHINE.read_text().replace(z, f"{z}.5\nposition_min: -1"))
+    stage = PlantStage(tmp_path, path)
+
+    async def go() -> None:
+        async with running(stage.served):
+            await stage.served.call("gcode.run", script="G28")
+            way_out = "raise position_max" if outside == "250.500" else "lower position_min"
+            with pytest.raises(ApiError, match=rf"would be {outside}, .*\(-1 to 250 mm\).*; {way_out}"):
+                await stage.served.call("gcode.run", script=script)
+            assert stage.served.service.machine is not None
+            assert not stage.served.service.machine.unsaved.pending
+
+    with asyncio.Runner(loop_factory=stage.stage.make_loop) as runner:
+        runner.run(go())
+
+
 async def check_refusals(run: Callable[[str], Awaitable[list[str]]]) -> None:
     for script, sentence in (
         ("MANUAL_PROBE", "comes before Z is homed"),

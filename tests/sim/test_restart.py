@@ -259,6 +259,51 @@ def test_a_file_that_was_edited_is_not_overwritten(tmp_path: Path) -> None:
     on_stage(tmp_path, go)
 
 
+@pytest.mark.parametrize("section", ["stepper_z", "printer"])
+def test_values_that_no_start_accepts_are_not_saved(tmp_path: Path, section: str) -> None:
+    """They were: the machine was in error after every start until somebody edited the file."""
+    config = tmp_path / "printer.cfg"
+    option = {"stepper_z": "position_endstop", "printer": "max_velocity"}[section]
+
+    async def go(stage: Served) -> None:
+        before = config.read_bytes()
+        live(stage).save(section, option, "-1000")
+        for _ in range(2):
+            with pytest.raises(ApiError, match=f"nothing was saved, .*{option}.*drop .* with RESTART"):
+                await run(stage, "SAVE_CONFIG")
+            assert config.read_bytes() == before
+        assert str(stage.service.state) == "ready"
+        assert stage.service.starts == 1
+        await run(stage, "RESTART")
+        await begun_anew(stage, 2)
+        assert config.read_bytes() == before
+
+    on_stage(tmp_path, go)
+
+
+def test_a_mistake_in_an_included_file_is_not_blamed_on_what_was_calibrated(tmp_path: Path) -> None:
+    config, part = tmp_path / "printer.cfg", tmp_path / "part.cfg"
+
+    async def go(stage: Served) -> None:
+        config.write_text(config.read_text() + "[include part.cfg]\n")
+        part.write_text("[printer]\nmax_velocity: 100\n")
+        await run(stage, "RESTART")
+        await begun_anew(stage, 2)
+        before = config.read_bytes()
+        live(stage).save("printer", "max_accel", "123")
+        part.write_text("[printer]\nmax_velocity: fast\n")
+        with pytest.raises(ApiError, match=r"nothing was saved, .*part\.cfg:2: .*max_velocity"):
+            await run(stage, "SAVE_CONFIG")
+        assert config.read_bytes() == before
+        part.write_text("[printer]\nmax_velocity: 100\n")
+        await run(stage, "SAVE_CONFIG")
+        await begun_anew(stage, 3)
+        assert stage.service.machine is not None
+        assert stage.service.machine.description.limits.max_accel == 123
+
+    on_stage(tmp_path, go)
+
+
 # ------------------------------------------------------------------------------ what nodes keep, and do not
 
 

@@ -7,6 +7,7 @@ from bisect import insort
 from collections.abc import Callable, Iterator
 from typing import Final, Protocol
 
+from coordinator.config.model import RailDescription
 from coordinator.gcode.builtins.state import go
 from coordinator.gcode.commands import AtStandstill, Call, Phases, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.events import Done, Reply
@@ -14,6 +15,7 @@ from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module
 from coordinator.support.values import Value
+from nodes.support.errors import CanductorError
 
 SPEED: Final = 5.0
 """mm/s of TESTZ, unless the beginning says otherwise."""
@@ -93,26 +95,26 @@ class ManualProbe(Module):
         return self._begin_at_speed(call, lambda z: (f"Z position is {z:.3f}",))
 
     def _read_calibrate(self, call: Call) -> Reading:
-        endstop = self._endstop(call)
-        return self._begin_at_speed(call, lambda z: self._keep(endstop - z))
+        rail, endstop = self._endstop(call)
+        return self._begin_at_speed(call, lambda z: self._keep(rail, endstop - z))
 
     def _read_apply(self, call: Call) -> Reading:
         call.parameters()
-        endstop = self._endstop(call)
+        rail, endstop = self._endstop(call)
         offset = call.figures()["gcode_move"]["homing_origin"].z  # type: ignore[attr-defined]
 
         async def apply() -> Done:
-            return Done(self._keep(endstop - offset) if offset else ("the offset of Z is 0",))
+            return Done(self._keep(rail, endstop - offset) if offset else ("the offset of Z is 0",))
 
         return AtStandstill(apply)
 
-    def _endstop(self, call: Call) -> float:
-        """Return position_endstop of stepper_z; raises WordError where there is none."""
+    def _endstop(self, call: Call) -> tuple[RailDescription, float]:
+        """Return the rail of stepper_z and its position_endstop; raises WordError where there is none."""
         for rail in self._machine.rails:
             if rail.axis == "z" and rail.steppers[0].name == "stepper_z":
                 found = rail.homing.position_endstop
                 if found is not None:
-                    return found
+                    return rail, found
         raise WordError(f"{call.command.name} needs a position_endstop of [stepper_z]; this machine has none")
 
     def _begin_at_speed(self, call: Call, accepted: Callable[[float], tuple[str, ...]]) -> Reading:
@@ -275,6 +277,15 @@ class ManualProbe(Module):
             )
         return self._accepted
 
-    def _keep(self, endstop: float) -> tuple[str, ...]:
+    def _keep(self, rail: RailDescription, endstop: float) -> tuple[str, ...]:
+        """Save ENDSTOP, mm, as position_endstop of RAIL; raises CanductorError for one outside its range."""
+        low, high = rail.position_min, rail.position_max
+        if (low is not None and endstop < low) or (high is not None and endstop > high):
+            way_out = "raise position_max" if high is not None and endstop > high else "lower position_min"
+            raise CanductorError(
+                f"position_endstop of [stepper_z] would be {endstop:.3f}, outside position_min and"
+                f" position_max ({low:g} to {high:g} mm), so it was not kept; {way_out} in the configuration,"
+                " then RESTART and calibrate again"
+            )
         self.live.save("stepper_z", "position_endstop", f"{endstop:.3f}")
         return (f"stepper_z: position_endstop: {endstop:.3f}; SAVE_CONFIG writes it and restarts",)

@@ -171,6 +171,14 @@ def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
         parse_config(str(path))
 
 
+def test_what_a_file_is_going_to_hold_is_read_and_counted(tmp_path: Path) -> None:
+    path = write(tmp_path, "[printer]\n", "printer.cfg")
+    write(tmp_path, "[later]\n", "later.cfg")
+    assert [*parse_config(str(path), data=b"[include later.cfg]\n").sections] == ["later"]
+    with pytest.raises(ConfigError, match=r"larger than 2 MB in all$"):
+        parse_config(str(path), data=b"\n" * 2_000_001)
+
+
 def test_a_pattern_over_too_many_files_is_refused(tmp_path: Path) -> None:
     budget = config_text.ReadBudget(directory_entries=10)
     for number in range(11):
