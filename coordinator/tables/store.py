@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from coordinator.support.atomic_file import atomic_write
 from coordinator.tables.axis_table import AxisTable, TableError, Unit
+from nodes.support.plain_json import read_json
 from nodes.support.state_folder import state_folder
 
 _AXIS: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", re.ASCII)
@@ -77,8 +78,8 @@ class TableStore:
 
 def _read(path: Path) -> AxisTable:
     try:
-        table = None if path.stat().st_size > FILE_BYTES_MAX else _table(json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError, TypeError, KeyError, RecursionError, OverflowError):
+        table = None if path.stat().st_size > FILE_BYTES_MAX else _table(read_json(path.read_text("utf-8")))
+    except (OSError, ValueError, TypeError, KeyError):
         table = None
     except TableError as error:
         raise TableError(f"{path}: {error}") from None

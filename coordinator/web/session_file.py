@@ -8,6 +8,7 @@ from coordinator.ipc.protocol.methods import Scope
 from coordinator.support.atomic_file import atomic_write
 from coordinator.web.access import SESSIONS_MAX, PageSession
 from nodes.support.errors import CanductorError
+from nodes.support.plain_json import read_json
 from nodes.support.secret_file import read_secret
 
 VERSION: Final = 1
@@ -22,10 +23,10 @@ def read_sessions(path: Path) -> list[PageSession]:
         return []
     text, _ = read_secret(path, "the page's sessions")
     try:
-        content = json.loads(text)
+        content = read_json(text)
         if content["version"] == VERSION:
             return [_session(one) for one in content["sessions"][:SESSIONS_MAX]]
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (ValueError, TypeError, KeyError, AttributeError):
         pass
     raise CanductorError(f"{path} does not hold the page's sessions; remove it")
 

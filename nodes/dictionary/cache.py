@@ -19,6 +19,7 @@ from typing import Final
 
 from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, Dictionary
 from nodes.dictionary.parts import DictionaryError
+from nodes.support.plain_json import read_json
 from nodes.support.user_folder import user_folder
 
 MAX_FILES: Final = 64
@@ -126,7 +127,7 @@ class DictionaryCache:
             return {}
         content = _read(self._folder / _ADDRESSES, b"")
         try:
-            found = json.loads(content or b"{}")
+            found = read_json(content or b"{}")
         except ValueError:
             return {}
         if not isinstance(found, dict):

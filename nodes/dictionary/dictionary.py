@@ -4,7 +4,6 @@ A dictionary comes off a wire and is untrusted until parsed: every size is bound
 DictionaryError with one sentence. Once parsed it does not change; decoding is total (a message or None).
 """
 
-import json
 import re
 import zlib
 from collections.abc import Mapping
@@ -18,6 +17,7 @@ from nodes.dictionary.parts import (
     parse_enumerations,
     parse_formats,
 )
+from nodes.support.plain_json import read_json
 
 MAX_INFLATED_BYTES: Final = 1 << 20
 """Largest compressed size; real dictionaries have 10 to 13 kB."""
@@ -80,8 +80,8 @@ class Dictionary:
         if len(text) > MAX_INFLATED_BYTES:
             raise DictionaryError(f"dictionary: has more than {MAX_INFLATED_BYTES} bytes; refused")
         try:
-            source = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant)
-        except (ValueError, RecursionError) as error:
+            source = read_json(text, _unique)
+        except ValueError as error:
             raise DictionaryError(f"dictionary: not usable JSON ({error})") from None
         if not isinstance(source, dict):
             raise DictionaryError("dictionary: not a JSON object")
@@ -262,10 +262,6 @@ def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{twice[:80]!r} stands twice in one object")
     return found
-
-
-def _refuse_constant(text: str) -> object:
-    raise ValueError(f"{text} is not a number")
 
 
 def _text(source: Mapping[str, object], key: str) -> str:

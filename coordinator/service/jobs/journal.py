@@ -9,7 +9,6 @@ newest entry. So is one whose last entry could not be written: half an entry mus
 import contextlib
 import hashlib
 import json
-import math
 import os
 import queue
 import threading
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.support.atomic_file import atomic_write, sync_folder
+from nodes.support.plain_json import read_json
 
 NAME: Final = ".canductor-journal"
 """Of the one that earlier versions kept in the job folder."""
@@ -114,13 +114,13 @@ def _is_sound(held: Mapping[str, Any]) -> bool:
 
 
 def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value) and abs(value) < _NUMBER_END  # type: ignore[arg-type]
+    return type(value) in (int, float) and abs(value) < _NUMBER_END  # type: ignore[arg-type]
 
 
 def _entry(line: bytes) -> dict[str, Any] | None:
     try:
-        entry = json.loads(line)
-    except (ValueError, RecursionError):
+        entry = read_json(line)
+    except ValueError:
         return None
     return entry if isinstance(entry, dict) else None
 

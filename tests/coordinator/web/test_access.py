@@ -1,6 +1,7 @@
 """Links and sessions of the page, without a server."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,10 @@ def test_sessions_are_bounded_and_the_one_not_used_longest_makes_room() -> None:
 # ------------------------------------------------------------------------------------------------- the file
 
 
+ENTRY = {"cookie": "", "key": "", "host": HOST, "scope": "watch", "token": None}
+"""Of a session in the file, without its time."""
+
+
 def session(**changes: object) -> PageSession:
     made = PageSession(b"c" * 32, b"k" * 32, HOST, Scope.OPERATE, b"t" * 32, 1.5e9)
     return dataclasses.replace(made, **changes)  # type: ignore[arg-type]
@@ -130,6 +135,7 @@ def test_a_file_that_others_can_write_is_not_believed(tmp_path: Path) -> None:
         '{"version":1,"sessions":{"a":1}}',
         '{"version":1,"sessions":[{"cookie":1}]}',
         "[" * 100_000,
+        json.dumps({"version": 1, "sessions": [{**ENTRY, "used_s": 10**1000}]}),
     ],
 )
 def test_a_file_that_is_none(tmp_path: Path, text: str) -> None:

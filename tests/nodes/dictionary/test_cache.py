@@ -153,6 +153,12 @@ def test_a_file_with_the_right_hash_that_is_no_dictionary_is_ignored(tmp_path: P
     assert cache.ignored_files == 1
 
 
+@pytest.mark.parametrize("content", ["[" * 100_000, "{", "7"])
+def test_damaged_addresses_are_ignored(tmp_path: Path, content: str) -> None:
+    (tmp_path / "nodes.json").write_text(content)
+    assert DictionaryCache(tmp_path).of_node("can0/000000000001") is None
+
+
 def test_pipes_links_and_huge_files_are_not_read(tmp_path: Path) -> None:
     folder, twin = tmp_path / "cache", build("v1")
     path = stored(folder, twin)

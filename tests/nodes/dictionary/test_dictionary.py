@@ -266,6 +266,8 @@ def test_hostile_parts_are_refused_in_a_sentence(parts: dict[str, Any], sentence
         (b'{"config": {"A": NaN}}', "NaN is not a number"),
         (b'{"version": "a", "version": "b"}', "'version' stands twice"),
         (b'{"config": {"A": ' + b"9" * 5000 + b"}}", "not usable JSON"),
+        (b'{"config": {"ADC_MAX": ' + b"9" * 400 + b"}}", "has more than 64 bits"),
+        (b'{"config": {"A": -1e999}}', "is too large"),
         (b" " * (MAX_INFLATED_BYTES + 1), "more than 1048576 bytes"),
     ],
 )

@@ -63,7 +63,10 @@ def test_wherever_it_is_cut_off_it_tells_an_earlier_line_or_none(tmp_path: Path)
              *(f'{{"journal":1,"file":"a","size":1,"modified_ns":1}}\n{{"line":3,"{name}":{value}}}'
                for name, value in (("speed_factor", '"x"'), ("speed_factor", "Infinity"), ("offset", "[1]"),
                                    ("offset", '["x",0,0,0]'), ("z", "[1,NaN]"), ("heaters", '{"bed":"60"}'),
-                                   ("heaters", '{"bed":Infinity}'), ("fans", "[1]"), ("excluded", "[1]")))],
+                                   ("heaters", '{"bed":Infinity}'), ("fans", "[1]"), ("excluded", "[1]"),
+                                   ("heaters", f'{{"bed":{"9" * 1000}}}'), ("speed_factor", "9" * 1000),
+                                   ("offset", f"[{'9' * 1000},0,0,0]"), ("bed_mm", "NaN"),
+                                   ("mesh", f'{{"heights":[[{"9" * 1000}]]}}')))],
 )  # fmt: skip
 def test_what_is_no_journal_tells_nothing(tmp_path: Path, text: str) -> None:
     path = tmp_path / NAME
