@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.service.jobs.journal import journal_path
 from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served
 
@@ -122,6 +123,26 @@ def test_it_heats_homes_above_the_part_and_goes_on(tmp_path: Path) -> None:
         assert stage.tree.get("job.interrupted_file") is None
         with pytest.raises(ApiError, match="no job was interrupted"):
             await stage.call("job.recover")
+
+    printer.serve(first, second)
+
+
+def test_a_journal_that_is_removed_while_it_prints_is_written_again(tmp_path: Path) -> None:
+    printer = Printer(tmp_path, SECTIONS)
+    journals: list[Path] = []
+
+    async def first(stage: Served) -> None:
+        await print_until(printer, stage, 0.35, 0.5)
+        state = stage.service.settings.state
+        assert state is not None
+        journals.append(journal_path(state, stage.jobs))
+        await stage.until(journals[0].exists, "the journal")
+        journals[0].unlink()
+        await asyncio.sleep(2.5)
+
+    async def second(stage: Served) -> None:
+        assert stage.tree.get("job.interrupted_file") == "job.gcode"
+        assert journals[0].exists()
 
     printer.serve(first, second)
 

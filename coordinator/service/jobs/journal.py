@@ -3,7 +3,8 @@
 One small file for each job folder, outside it: front ends list what is in there. Each entry is a line of
 JSON, appended by a thread of its own and brought to the disk every SYNC_S; a power cut costs the last entries
 and nothing else. A file beyond FILE_BYTES_MAX is written again with what still counts: its head and its
-newest entry. So is one whose last entry could not be written: half an entry must not spoil the next one.
+newest entry. So is one whose last entry could not be written: half an entry must not spoil the next one. And
+so is one that somebody removed or changed meanwhile.
 """
 
 import contextlib
@@ -20,6 +21,7 @@ from typing import Any, Final
 
 from coordinator.support.atomic_file import atomic_write, sync_folder
 from nodes.support.plain_json import read_json
+from nodes.support.regular_file import open_regular
 
 NAME: Final = ".canductor-journal"
 """Of the one that earlier versions kept in the job folder."""
@@ -125,6 +127,10 @@ def _entry(line: bytes) -> dict[str, Any] | None:
     return entry if isinstance(entry, dict) else None
 
 
+def _line(entry: Mapping[str, Any]) -> bytes:
+    return json.dumps(entry, separators=(",", ":")).encode() + b"\n"
+
+
 class Journal:
     """Writes the journal at PATH. ON_FAILURE gets a sentence, once. CLOCK_S is monotonic, in s."""
 
@@ -205,19 +211,29 @@ class Journal:
 
     def _write(self, head: dict[str, Any] | None, entry: dict[str, Any], size: int) -> int:
         """Write ENTRY and return how large the file is then."""
-        text = json.dumps(entry, separators=(",", ":")) + "\n"
-        if entry is head or size + len(text) > FILE_BYTES_MAX:
-            whole = text if entry is head or head is None else json.dumps(head) + "\n" + text
-            atomic_write(self._path, whole.encode())
-            return len(whole)
-        with self._path.open("ab") as file:
-            file.write(text.encode())
-        return size + len(text)
+        data = _line(entry)
+        if entry is not head and size + len(data) <= FILE_BYTES_MAX and self._append(data, size):
+            return size + len(data)
+        whole = data if entry is head or head is None else _line(head) + data
+        atomic_write(self._path, whole)
+        return len(whole)
+
+    def _append(self, data: bytes, size: int) -> bool:
+        """Append DATA to the file of SIZE; return False where somebody removed, cut or replaced it."""
+        try:
+            fd = open_regular(self._path, os.O_WRONLY | os.O_APPEND)
+        except OSError:
+            return False
+        with os.fdopen(fd, "ab") as file:
+            if os.fstat(fd).st_size != size:
+                return False
+            file.write(data)
+        return True
 
     def _sync(self, size: int) -> int:
         """Bring the file of SIZE to the disk; return its size, FILE_BYTES_MAX if it must be written again."""
         try:
-            fd = os.open(self._path, os.O_RDONLY)
+            fd = open_regular(self._path)
             try:
                 os.fsync(fd)
             finally:

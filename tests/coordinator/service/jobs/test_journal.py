@@ -1,7 +1,8 @@
 """The journal of jobs: whatever cuts it off, what it says is true."""
 
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,42 @@ def test_what_is_no_journal_tells_nothing(tmp_path: Path, text: str) -> None:
     path = tmp_path / NAME
     path.write_text(text, encoding="utf-8")
     assert read_journal(path) is None
+
+
+def wait_for_line(path: Path, line: int) -> None:
+    """Return when the journal's thread has written LINE."""
+    while (found := read_journal(path)) is None or found.line != line:
+        pass
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        Path.unlink,
+        lambda path: os.truncate(path, 0),
+        lambda path: os.truncate(path, path.stat().st_size - 3),
+        lambda path: path.write_text("nonsense"),
+    ],
+    ids=["removed", "emptied", "cut", "overwritten"],
+)
+def test_what_is_spoiled_while_printing_is_written_again(
+    tmp_path: Path, spoil: Callable[[Path], object]
+) -> None:
+    """The entries that followed had no head: no job was offered after a crash."""
+    failures: list[str] = []
+    journal = Journal(tmp_path / NAME, failures.append)
+    journal.begin("part.gcode", 1000, 77)
+    journal.note(5, {})
+    wait_for_line(tmp_path / NAME, 5)
+    spoil(tmp_path / NAME)
+    journal.note(9, {"speed_factor": 2.0})
+    journal.note(13, {"speed_factor": 2.0})
+    journal.close()
+    assert not failures
+    assert read_journal(tmp_path / NAME) == Interrupted(
+        "part.gcode", 1000, 77, 13, {"speed_factor": 2.0, "line": 13}
+    )
 
 
 def test_it_stays_small(tmp_path: Path) -> None:
