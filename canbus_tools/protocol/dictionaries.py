@@ -20,6 +20,7 @@ from nodes.dictionary.parts import DictionaryError
 from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import Assignments, existing_file, parse_assignment, parse_int
+from nodes.support.regular_file import read_regular
 
 GIVEN: Final = "given"
 LEARNT: Final = "learnt from the bus"
@@ -198,8 +199,7 @@ def read_dictionary(path: Path) -> Dictionary:
     """Read a dictionary's file, JSON or zlib-compressed; raises CanductorError."""
     existing_file(path)
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_INFLATED_BYTES + 1)
+        content = read_regular(path, MAX_INFLATED_BYTES + 1)
     except OSError as error:
         raise CanductorError(f"dictionary '{path}' cannot be read: {error.strerror or error}") from None
     try:

@@ -3,10 +3,12 @@
 The readable frames of a damaged or truncated file are yielded; then a CanductorError reports the place.
 """
 
+import os
 from collections.abc import Callable, Iterator
-from io import BufferedReader, TextIOWrapper
+from functools import partial
+from io import BufferedReader, FileIO, TextIOWrapper
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import can
 
@@ -24,6 +26,8 @@ _ASC_BEGINNINGS: Final = (b"date ", b"base ", b"// ", b"begin ", b"internal ")
 _MAGIC_SIZE: Final = 16
 _TIME_END_S: Final = 1e12
 
+BeforeRead = Callable[[BinaryIO | FileIO], object]
+
 
 def read_frames(path: Path) -> Iterator[Frame]:
     """Yield the frames of a file in its order; raises CanductorError.
@@ -35,24 +39,47 @@ def read_frames(path: Path) -> Iterator[Frame]:
         yield from frames
 
 
-def read_batches(path: Path, before_read: Callable[[], object] | None = None) -> Iterator[list[Frame]]:
+def read_batches(path: Path, before_read: BeforeRead | None = None) -> Iterator[list[Frame]]:
     """Yield the frames as read_frames does, but in lists, which is faster.
 
-    BEFORE_READ is called before each read of a log.
+    BEFORE_READ gets what is about to be read where that may have to be waited for: a pipe, standard input.
     """
     if path == STANDARD_INPUT:
-        yield from read_candump(standard_input().buffer, "standard input", before_read)
+        source = standard_input().buffer
+        wait = None if before_read is None else partial(before_read, source)
+        yield from read_candump(source, "standard input", wait)
         return
     existing_file(path)
     try:
-        with path.open("rb") as file:
+        with path.open("rb") if before_read is None else _open_patiently(path, before_read) as file:
             reader = _reader(file, path)
             if reader is None:
-                yield from read_candump(file, str(path), before_read)
+                yield from read_candump(file, str(path))
             else:
                 yield from _in_batches(reader(file, str(path)))
     except OSError as error:
         raise CanductorError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+class _AwaitedFile(FileIO):
+    """A file of which each read has to be waited for, and is announced to BEFORE_READ."""
+
+    def __init__(self, fd: int, before_read: BeforeRead) -> None:
+        super().__init__(fd)
+        self._before_read = before_read
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        """Do as FileIO does."""
+        self._before_read(self)
+        return super().readinto(buffer)
+
+
+def _open_patiently(path: Path, before_read: BeforeRead) -> BufferedReader:
+    """Open PATH without waiting for who writes into it, if it is a pipe: BEFORE_READ does; raises OSError."""
+    if path.is_file():
+        return path.open("rb")
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    return BufferedReader(_AwaitedFile(fd, before_read))
 
 
 def _in_batches(frames: Iterator[Frame]) -> Iterator[list[Frame]]:

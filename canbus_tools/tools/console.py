@@ -15,7 +15,7 @@ from canbus_tools.console.session import Quit, Session
 from canbus_tools.discovery.inventory import take_inventory
 from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, existing_file, integer, options_from, parse_int
+from nodes.support.option_values import UsageError, integer, options_from, parse_int, regular_file
 from nodes.support.standard_input import standard_input
 from nodes.support.terminal import show
 from nodes.support.user_folder import user_folder
@@ -71,7 +71,7 @@ def declare(command: argparse.ArgumentParser) -> None:
         action="append",
         help="run this line; may be repeated",
     )
-    add("--script", type=existing_file, metavar="FILE", help="run the lines of this file; stop at an error")
+    add("--script", type=regular_file, metavar="FILE", help="run the lines of this file; stop at an error")
 
 
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "ConsoleReport"]:

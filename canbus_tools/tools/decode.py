@@ -5,6 +5,7 @@ import re
 import select
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -21,7 +22,6 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file
-from nodes.support.standard_input import standard_input
 from nodes.support.terminal import show, show_error
 
 LINES_HELD: Final = 500
@@ -92,7 +92,7 @@ class _StoppedError(Exception):
     """The user ended it while it waited for input."""
 
 
-def _readable(file: BinaryIO) -> bool:
+def _readable(file: BinaryIO | FileIO) -> bool:
     """Wait for input, LOOK_S at most; True also for files that select cannot wait for."""
     try:
         return bool(select.select([file], [], [], LOOK_S)[0])
@@ -140,7 +140,7 @@ class Decoding:
 
     def _decode(self, file: Path) -> None:
         try:
-            for frames in read_batches(file, self._wait_for_input if file == STANDARD_INPUT else None):
+            for frames in read_batches(file, self._wait_for_input):
                 if not self.frames:
                     self._set_limits(frames[0].time_s)
                 if self._flag.stopped or self._feed(frames):
@@ -150,10 +150,10 @@ class Decoding:
         except CanductorError as error:
             self.problems.append(str(error))
 
-    def _wait_for_input(self) -> None:
-        """Write the lines so far, and wait for input; Ctrl-C ends only the waiting."""
+    def _wait_for_input(self, file: BinaryIO | FileIO) -> None:
+        """Write the lines so far, and wait for input from FILE; Ctrl-C ends only the waiting."""
         self._write()
-        while not (self._flag.stopped or _readable(standard_input().buffer)):
+        while not (self._flag.stopped or _readable(file)):
             pass
         if self._flag.stopped:
             raise _StoppedError

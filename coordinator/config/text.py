@@ -2,12 +2,12 @@
 
 import fnmatch
 import os
-import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from coordinator.config.errors import ConfigError, Place
 from coordinator.support.quoting import shown_path
+from nodes.support.regular_file import read_regular
 
 MAX_FILES = 200
 MAX_BYTES = 2_000_000
@@ -54,11 +54,7 @@ def read_bytes(path: str, place: Place, budget: ReadBudget) -> bytes:
     if budget.files < 1:
         raise ConfigError(place, f"more than {MAX_FILES} files are included")
     try:
-        # Looked at before it is opened: opening a FIFO or a device may block or act.
-        if not stat.S_ISREG(Path(path).stat().st_mode):
-            raise ConfigError(place, f"{shown_path(path)} is not a regular file")
-        with Path(path).open("rb") as file:
-            data = file.read(budget.bytes + 1)
+        data = read_regular(path, budget.bytes + 1)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a valid path"
         raise ConfigError(place, f"cannot read {shown_path(path)}: {reason}") from None

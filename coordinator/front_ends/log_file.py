@@ -19,12 +19,15 @@ from coordinator.service.core.machine_service import MachineService, ServiceStat
 from coordinator.service.state.log_ring import Entry
 from coordinator.support.values import Value
 from coordinator.support.version import VERSION
+from nodes.support.regular_file import open_regular
 
 FILE_BYTES_MAX: Final = 10_485_760
 """A larger file is renamed to NAME.1, that to NAME.2, and so on."""
 KEPT: Final = 5
 """Older files."""
 STATISTICS_S: Final = 30.0
+CLOSE_S: Final = 1.0
+"""A disk that does not answer must not keep the service from ending."""
 _SHOWN: Final = (
     "nodes.",
     "buses.",
@@ -62,9 +65,9 @@ class LogFile:
         """Have the lines written that TEXT returns; without effect when too many wait."""
         self._thread.add(text)
 
-    def close(self) -> None:
-        """Wait until all is written."""
-        self._thread.close()
+    def close(self, wait_s: float | None = CLOSE_S) -> None:
+        """Wait until all is written, WAIT_S at most (None: as long as it takes)."""
+        self._thread.close(wait_s)
 
     # -------------------------------------------------------------------------------------- the thread
 
@@ -83,7 +86,7 @@ class LogFile:
             size = 0
         if size and size + len(data) > FILE_BYTES_MAX:
             self._rotate()
-        with self._path.open("ab") as file:
+        with open(self._path, "ab", opener=open_regular) as file:  # a FIFO would be waited for
             file.write(data)
 
     def _rotate(self) -> None:

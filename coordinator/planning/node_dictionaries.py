@@ -15,8 +15,9 @@ from typing import Any, Final
 from coordinator.config.model import MachineDescription, NodeDescription
 from coordinator.planning.options import PlanOptions
 from nodes.dictionary.cache import DictionaryCache
-from nodes.dictionary.dictionary import Dictionary
+from nodes.dictionary.dictionary import MAX_INFLATED_BYTES, Dictionary
 from nodes.support.errors import CanductorError
+from nodes.support.regular_file import read_regular
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_path
 
 Ranges = Mapping[str, int]
@@ -160,7 +161,7 @@ def _with_pins(build: str, pins: Ranges) -> Dictionary:
 
 def _read_dictionary(path: Path) -> Dictionary:
     try:
-        text = path.read_bytes()
+        text = read_regular(path, MAX_INFLATED_BYTES + 1)
     except OSError as error:
         raise CanductorError(f"cannot read the dictionary {path}: {error.strerror}; check the path") from None
     try:

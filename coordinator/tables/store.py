@@ -8,6 +8,7 @@ from typing import Any, Final
 from coordinator.support.atomic_file import atomic_write
 from coordinator.tables.axis_table import AxisTable, TableError, Unit
 from nodes.support.plain_json import read_json
+from nodes.support.regular_file import read_regular
 from nodes.support.state_folder import state_folder
 
 _AXIS: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", re.ASCII)
@@ -78,7 +79,8 @@ class TableStore:
 
 def _read(path: Path) -> AxisTable:
     try:
-        table = None if path.stat().st_size > FILE_BYTES_MAX else _table(read_json(path.read_text("utf-8")))
+        data = read_regular(path, FILE_BYTES_MAX + 1)
+        table = None if len(data) > FILE_BYTES_MAX else _table(read_json(data))
     except (OSError, ValueError, TypeError, KeyError):
         table = None
     except TableError as error:

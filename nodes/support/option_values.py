@@ -191,6 +191,14 @@ def existing_file(path: str | Path) -> Path:
     return path
 
 
+def regular_file(path: str | Path) -> Path:
+    """Return the path of a file that can be read, but of no pipe and no device; raises CanductorError."""
+    path = existing_file(path)
+    if not path.is_file():
+        raise CanductorError(f"'{path}' is not a regular file; save its content to one, and give that")
+    return path
+
+
 def add_command(
     commands: Any,
     name: str,

@@ -107,7 +107,7 @@ class JournalWriter(Writer):
         journal = Journal(folder / NAME, _never)
         journal.begin("before.gcode", 10, 10)
         journal.note(5, {"speed_factor": 5.0})
-        journal.close()
+        journal.close(None)
 
     def write(self, folder: Path, mark: Mark) -> str:
         failures: list[str] = []
@@ -121,7 +121,7 @@ class JournalWriter(Writer):
             journal.note(version, {"speed_factor": float(version), "text": self._HELD})
         mark(f"begun {self.versions}")
         journal.end()
-        journal.close()
+        journal.close(None)
         if not failures:
             mark(f"done {self.versions}")
         return "; ".join(failures)

@@ -9,7 +9,7 @@ from typing import Final
 from coordinator.front_ends.serve import ServeOptions
 from coordinator.support.examples import machine_name
 from nodes.support.numbers import read_int
-from nodes.support.option_values import UsageError, existing_file, options_from
+from nodes.support.option_values import UsageError, options_from, regular_file
 
 HOST_NAME_MAX: Final = 253
 _LABEL: Final = re.compile(r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?", re.ASCII)
@@ -51,11 +51,11 @@ def declare_serving(command: argparse.ArgumentParser) -> None:
     add(
         "--tls-certificate",
         dest="certificate",
-        type=existing_file,
+        type=regular_file,
         metavar="FILE",
         help="certificate chain (PEM)",
     )
-    add("--tls-key", dest="private_key", type=existing_file, metavar="FILE", help="private key (PEM)")
+    add("--tls-key", dest="private_key", type=regular_file, metavar="FILE", help="private key (PEM)")
     add(
         "--no-tls-on-loopback",
         dest="plain_on_loopback",

@@ -4,7 +4,7 @@ import argparse
 
 from coordinator.ipc.client.target import Target
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import decimal, existing_file, options_from
+from nodes.support.option_values import decimal, existing_file, options_from, regular_file
 from nodes.support.secret_file import read_secret
 
 
@@ -21,7 +21,7 @@ def declare_target(command: argparse.ArgumentParser) -> None:
     )
     add(
         "--certificate",
-        type=existing_file,
+        type=regular_file,
         metavar="PEM",
         help="trust only servers whose certificate is this one, or signed by it",
     )

@@ -19,6 +19,7 @@ from nodes.support.option_values import (
     existing_file,
     integer,
     options_from,
+    regular_file,
 )
 
 CONTROL: Final = "control"
@@ -149,7 +150,7 @@ def _declare_receive(command: argparse.ArgumentParser) -> None:
 
 def _declare_send(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
-    add("file", type=existing_file, help="file to send")
+    add("file", type=regular_file, help="file to send")
     add("--name", help="name at the other side (default: that of the file, without its suffix)")
     _declare_code(command, None, " (default: by the file's suffix)")
     add(

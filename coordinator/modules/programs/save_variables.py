@@ -22,6 +22,7 @@ from coordinator.support.atomic_file import atomic_write
 from coordinator.support.quoting import shown_path
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
+from nodes.support.regular_file import read_regular
 
 FILENAME = TextOption(name="filename", help="The file, relative to that of the configuration; ~ is your home")
 VARIABLES_MAX: Final = 1000
@@ -104,8 +105,7 @@ class SaveVariables(Module):
 def read_variables(path: Path) -> dict[str, Any]:
     """Return the values in the file PATH, none when there is no file; raises CanductorError."""
     try:
-        with path.open("rb") as file:
-            data = file.read(FILE_BYTES_MAX + 1)
+        data = read_regular(path, FILE_BYTES_MAX + 1)
     except FileNotFoundError:
         return {}
     except OSError as error:

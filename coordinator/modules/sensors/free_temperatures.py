@@ -33,6 +33,7 @@ from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
 from nodes.support.numbers import read_int
+from nodes.support.regular_file import read_regular
 
 LOWEST_C: Final = -273.15
 HIGHEST_C: Final = 1500.0
@@ -146,7 +147,7 @@ class HostTemperature(TemperatureSource):
 
     def _look(self) -> None:
         try:
-            text = self._path.read_text(encoding="ascii", errors="replace")[:64].strip()
+            text = read_regular(self._path, 64).decode("ascii", "replace").strip()
         except OSError as error:
             raise CanductorError(
                 f"[{self.name}]: {self._path} cannot be read: {error.strerror}; correct sensor_path"

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.support.atomic_file import atomic_write
+from nodes.support.regular_file import read_regular
 
 HISTORY_MAX: Final = 100
 """Jobs that are kept, the newest ones."""
@@ -90,8 +91,7 @@ class JobHistory:
 def _read(path: Path) -> list[EndedJob]:
     """Return the jobs in the file at PATH; what is no job is left out."""
     try:
-        with path.open("rb") as file:
-            found = json.loads(file.read(_FILE_BYTES_MAX))
+        found = json.loads(read_regular(path, _FILE_BYTES_MAX))
     except (OSError, ValueError, RecursionError):
         return []
     return [job for entry in found if (job := _job(entry)) is not None] if isinstance(found, list) else []

@@ -21,13 +21,15 @@ from typing import Any, Final
 
 from coordinator.support.atomic_file import atomic_write, sync_folder
 from nodes.support.plain_json import read_json
-from nodes.support.regular_file import open_regular
+from nodes.support.regular_file import open_regular, read_regular
 
 NAME: Final = ".canductor-journal"
 """Of the one that earlier versions kept in the job folder."""
 ENTRY_S: Final = 1.0
 """Entries are that far apart."""
 SYNC_S: Final = 2.0
+CLOSE_S: Final = 1.0
+"""A disk that does not answer must not keep the service from ending."""
 FILE_BYTES_MAX: Final = 262_144
 WAITING_MAX: Final = 64
 _VERSION: Final = 1
@@ -60,8 +62,7 @@ def journal_path(state: Path, jobs: Path, kind: str = "journal") -> Path:
 def read_journal(path: Path) -> Interrupted | None:
     """Return the job that the journal at PATH breaks off in, or None."""
     try:
-        with path.open("rb") as file:
-            data = file.read(4 * FILE_BYTES_MAX)
+        data = read_regular(path, 4 * FILE_BYTES_MAX)
     except OSError:
         return None
     head: dict[str, Any] | None = None
@@ -165,10 +166,10 @@ class Journal:
         """Record that the job ended, by itself or on request."""
         self._put({"ended": True})
 
-    def close(self) -> None:
-        """Wait until all is on the disk."""
+    def close(self, wait_s: float | None = CLOSE_S) -> None:
+        """Wait until all is on the disk, WAIT_S at most (None: as long as it takes)."""
         self._waiting.put(None)
-        self._thread.join()
+        self._thread.join(wait_s)
 
     def _put(self, entry: dict[str, Any]) -> None:
         """Have ENTRY written; a slow disk may cost lines of a job, but never its begin or its end."""

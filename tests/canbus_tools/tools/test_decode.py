@@ -233,6 +233,25 @@ def test_a_piped_log_is_followed_and_ctrl_c_ends_it_in_order() -> None:
     assert (summary["ok"], summary["stopped"], summary["frames"]) == (True, True, 3)
 
 
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_pipe_is_read_as_it_comes_and_left_when_asked(tmp_path: Path, number: signal.Signals) -> None:
+    """Nothing could end it while it waited for the pipe, but SIGKILL."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    command = [sys.executable, "-m", "coordinator.cli.main", "can", "decode", str(pipe), "--json"]
+    writer = os.open(pipe, os.O_RDWR)  # waits for no reader, and never lets the pipe end
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        os.write(writer, b"(1.5) can0 3F0#00\n")
+        assert json.loads(process.stdout.readline())["time_s"] == 1.5
+        os.kill(process.pid, number)
+        summary = json.loads(process.stdout.readline())
+        assert process.wait(60) == 0
+    os.close(writer)
+    assert (summary["ok"], summary["stopped"], summary["frames"]) == (True, True, 1)
+
+
 def test_candump_of_a_screen(capsys: Output, monkeypatch: pytest.MonkeyPatch) -> None:
     piped = io.TextIOWrapper(
         io.BytesIO(b"  can0  3F0   [1]  00\n  can0  3F1   [8]  20 90 A4 AE 02 2D FC 01\n")

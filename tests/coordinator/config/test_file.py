@@ -107,8 +107,8 @@ def test_of_an_option_given_again_the_last_holds_and_one_notice_says_so(tmp_path
         (b"[a]\nx: \xff\n", "printer.cfg:2: byte 0xff is not UTF-8 text; save the file as UTF-8"),
         ("[include]\n", "printer.cfg:1: [include] needs a file name: [include other.cfg]"),
         ("\n[include no.cfg]\n", "printer.cfg:2: cannot read 'no.cfg': No such file or directory"),
-        ("[include .]\n", "printer.cfg:1: '.' is not a regular file"),
-        ("[include /dev/zero]\n", "printer.cfg:1: '/dev/zero' is not a regular file"),
+        ("[include .]\n", "printer.cfg:1: cannot read '.': Not a regular file"),
+        ("[include /dev/zero]\n", "printer.cfg:1: cannot read '/dev/zero': Not a regular file"),
         ("[include printer.cfg]\n", "printer.cfg:1: 'printer.cfg' includes itself"),
     ],
 )

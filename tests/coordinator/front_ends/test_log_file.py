@@ -17,7 +17,7 @@ def test_files_take_turns_and_old_ones_go(tmp_path: Path) -> None:
     for turn in range(2):  # each writes more than half a file; the second finds what an earlier service left
         log = LogFile(path, failures.append)
         log.add(lambda turn=turn: f"turn {turn}\n{BLOCK}")  # type: ignore[misc]
-        log.close()
+        log.close(None)
     assert failures == []
     assert sorted(tmp_path.iterdir()) == [path, *older]
     begins = []
@@ -42,7 +42,7 @@ def test_what_the_disk_has_no_time_for_is_counted(tmp_path: Path) -> None:
     for number in range(WAITING_MAX + 7):
         log.add(lambda number=number: f"line {number}\x1b[31m")  # type: ignore[misc]
     slow.set()
-    log.close()
+    log.close(None)
     lines = path.read_text(encoding="utf-8").splitlines()
     assert lines[0] == "first"
     assert "7 entries were left out here: the disk is slow" in lines
@@ -56,6 +56,6 @@ def test_a_file_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     log = LogFile(tmp_path / "none" / "canductor.log", failures.append)
     for _ in range(3):
         log.add(lambda: "nothing")
-    log.close()
+    log.close(None)
     assert len(failures) == 1
     assert failures[0].endswith("none/canductor.log cannot be written: no such file or directory")

@@ -18,7 +18,7 @@ def written(folder: Path, *entries: tuple[int, Mapping[str, object]], ended: boo
         journal.note(line, held)
     if ended:
         journal.end()
-    journal.close()
+    journal.close(None)
     assert not failures
     return folder / NAME
 
@@ -75,6 +75,11 @@ def test_what_is_no_journal_tells_nothing(tmp_path: Path, text: str) -> None:
     assert read_journal(path) is None
 
 
+def make_fifo(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
 def wait_for_line(path: Path, line: int) -> None:
     """Return when the journal's thread has written LINE."""
     while (found := read_journal(path)) is None or found.line != line:
@@ -89,8 +94,9 @@ def wait_for_line(path: Path, line: int) -> None:
         lambda path: os.truncate(path, 0),
         lambda path: os.truncate(path, path.stat().st_size - 3),
         lambda path: path.write_text("nonsense"),
+        make_fifo,
     ],
-    ids=["removed", "emptied", "cut", "overwritten"],
+    ids=["removed", "emptied", "cut", "overwritten", "fifo"],
 )
 def test_what_is_spoiled_while_printing_is_written_again(
     tmp_path: Path, spoil: Callable[[Path], object]
@@ -104,7 +110,7 @@ def test_what_is_spoiled_while_printing_is_written_again(
     spoil(tmp_path / NAME)
     journal.note(9, {"speed_factor": 2.0})
     journal.note(13, {"speed_factor": 2.0})
-    journal.close()
+    journal.close(None)
     assert not failures
     assert read_journal(tmp_path / NAME) == Interrupted(
         "part.gcode", 1000, 77, 13, {"speed_factor": 2.0, "line": 13}
@@ -127,6 +133,6 @@ def test_a_disk_that_cannot_be_written_is_told_once(tmp_path: Path) -> None:
     journal.begin("part.gcode", 1, 1)
     journal.note(1, {})
     journal.note(2, {})
-    journal.close()
+    journal.close(None)
     assert len(told) == 1
     assert "no such file" in told[0]
