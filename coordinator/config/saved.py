@@ -4,6 +4,7 @@ The file is replaced in one step or not at all, and what the user wrote stays as
 """
 
 import codecs
+import errno
 import os
 import re
 import stat
@@ -22,6 +23,12 @@ from nodes.support.errors import CanductorError
 NOTICE: Final = "DO NOT EDIT THIS BLOCK OR BELOW. The machine writes it; its values override those above."
 _SAVED_SECTION = re.compile(re.escape(SAVED_PREFIX) + r" ?\[([^\[\]]+)\]\s*")
 _ENDS = re.compile(rb"\r\n|\r|\n")
+_WAYS_OUT: Final = {
+    errno.ENOSPC: "free some space on its disk",
+    errno.EDQUOT: "free some space: your quota of its disk is used up",
+    errno.EIO: "check its disk",
+}
+"""What to do, by errno."""
 
 Values = Mapping[str, Mapping[str, str]]
 """Options as text, by section."""
@@ -217,7 +224,5 @@ def replace_file(path: str, before: bytes, after: bytes) -> None:
             raise PermissionError(13, "it is write-protected")
         atomic_write(real, after, like=status)
     except OSError as error:
-        raise SaveError(
-            f"cannot write {shown_path(path)}: {error.strerror or error}; make the file and its folder"
-            " writable"
-        ) from None
+        way_out = _WAYS_OUT.get(error.errno or 0, "make the file and its folder writable")
+        raise SaveError(f"cannot write {shown_path(path)}: {error.strerror or error}; {way_out}") from None

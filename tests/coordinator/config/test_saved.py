@@ -1,5 +1,6 @@
 """What SAVE_CONFIG writes: read again it is what was meant, and the user's own text is untouched."""
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -109,18 +110,28 @@ def test_a_file_that_changed_meanwhile_is_left_alone(tmp_path: Path) -> None:
         config.write()
 
 
+@pytest.mark.parametrize(
+    ("number", "way_out"),
+    [
+        (errno.ENOSPC, "free some space on its disk"),
+        (errno.EDQUOT, "free some space: your quota"),
+        (errno.EIO, "check its disk"),
+        (errno.EROFS, "make the file and its folder writable"),
+        (errno.EACCES, "make the file and its folder writable"),
+    ],
+)
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_beside_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, way_out: str
 ) -> None:
     path = tmp_path / "printer.cfg"
     path.write_text(USER)
     before = path.read_bytes()
 
-    def full(_: int) -> None:
-        raise OSError(28, "No space left on device")
+    def fail(_: int) -> None:
+        raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(SaveError, match="No space left on device; make the file and its folder writable"):
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(SaveError, match=f"{os.strerror(number)}; {way_out}"):
         replace_file(str(path), before, b"new")
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
