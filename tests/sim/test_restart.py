@@ -406,3 +406,31 @@ def test_a_bug_that_a_start_meets_ends_the_start_and_not_the_service(
     (log,) = tmp_path.glob("canductor-*.log")
     assert causes == [f"internal error: ValueError: of a bug; please report it with {log}"]
     assert "Traceback" in log.read_text()
+
+
+@pytest.mark.parametrize(
+    ("script", "sentence"),
+    [
+        ("M109 S200", "waits, such as M109 .* cancel that call"),
+        ("G28\nG1 X50 F60", "the machine moves; .*, or"),
+    ],
+)
+def test_a_restart_that_is_refused_says_what_it_waits_for(tmp_path: Path, script: str, sentence: str) -> None:
+    """It asked to cancel a job when there was none, and said that a machine that stood moves."""
+
+    async def go(stage: Served) -> None:
+        motion = stage.service.motion
+        assert motion is not None
+        waiting = asyncio.ensure_future(run(stage, script))
+        stands = script.startswith("M109")
+        await stage.until(lambda: motion.feeder.busy if stands else not motion.standing, "the script")
+        with pytest.raises(ApiError, match=sentence) as error:
+            await stage.call("machine.restart")
+        assert error.value.code == "busy"
+        assert "job" not in error.value.sentence
+        await stage.call("machine.emergency_stop")
+        await asyncio.gather(waiting, return_exceptions=True)
+        await stage.call("machine.restart")
+        await begun_anew(stage, 2)
+
+    serve(heated(tmp_path, ""), tmp_path, go)

@@ -391,8 +391,20 @@ class MachineService:
         elif self.state not in (ServiceState.SHUTDOWN, ServiceState.ERROR):
             motion = self.ready_motion()
             if motion.feeder.busy or not motion.standing:
-                raise ApiError("busy", "the machine moves; wait until it stands, or cancel the job first")
+                raise ApiError("busy", self._why_busy(motion))
         self._restart_now(firmware)
+
+    def _why_busy(self, motion: Motion) -> str:
+        """Return why the machine cannot restart while it works, and what to do."""
+        if self.active_job is not None:
+            return "a job prints or is paused; wait for its end, or cancel it with job.cancel"
+        stop = "or stop the machine first with machine.emergency_stop"
+        if motion.feeder.busy and motion.standing:
+            return (
+                "g-code of a client is not done: it homes, probes or waits, such as M109 for a heater; wait"
+                f" for its end, cancel that call, {stop}"
+            )
+        return f"the machine moves; wait until it stands, {stop}"
 
     def restart_in_job(self, *, firmware: bool) -> None:
         """Cancel the job, which ends before its next line, and restart when its moves are done."""
