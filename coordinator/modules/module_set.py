@@ -137,6 +137,7 @@ class ModuleSet:
         self.pins = pins
         self.config = config or {}
         self.settings = settings or {}
+        self._unsupported = [name for name in self.config if name.partition(" ")[0] in UNSUPPORTED_SECTIONS]
         self._machine = machine
         self._modules: list[Module] = []
         self._named: dict[str, list[Module]] = {}
@@ -174,7 +175,7 @@ class ModuleSet:
             self._machine,
             whole=source.whole,
             share=self._share,
-            unsupported=[name for name in self.config if name.partition(" ")[0] in UNSUPPORTED_SECTIONS],
+            unsupported=self._unsupported,
         )
         with _blamed(source.kind, source.section.place):
             module = source.kind(build)
