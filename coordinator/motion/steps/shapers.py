@@ -75,8 +75,8 @@ def check_reach(written: str, frequency_hz: float, damping_ratio: float) -> None
     reach_s = max(abs(time_s) for _, time_s in shaper_impulses(written, frequency_hz, damping_ratio))
     if reach_s > REACH_MAX_S:
         raise ValueError(
-            f"{written} of {frequency_hz:g} Hz with a damping ratio of {damping_ratio:g} reaches {reach_s:.2f} s"
-            f" far, {REACH_MAX_S:g} s at most; give a higher frequency"
+            f"{written} of {frequency_hz:g} Hz with a damping ratio of {damping_ratio:g} reaches"
+            f" {reach_s:.2f} s far, {REACH_MAX_S:g} s at most; give a higher frequency"
         )
 
 
