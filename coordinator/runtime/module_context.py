@@ -2,10 +2,10 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
-from coordinator.config.saved import SaveError
+from coordinator.config.saved import SaveError, checked
 from coordinator.runtime.machine import Machine
 from nodes.clock.clock import Ticks, extend32
 from nodes.node.node import Node
@@ -96,6 +96,11 @@ class ModuleContext:
     def save(self, section: str, option: str, text: str) -> None:
         """Save a calibrated value with the next SAVE_CONFIG; raises SaveError for text it cannot write."""
         self.machine.unsaved.put(section, option, text)
+
+    def save_soon(self, section: str, options: Mapping[str, str]) -> None:
+        """Do the same with OPTIONS, from any thread; what takes long is done in that thread."""
+        found = checked(section, options)
+        self.soon_on_loop(lambda: self.machine.unsaved.put_checked(section, found))
 
     def remove_saved(self, section: str) -> None:
         """Have SAVE_CONFIG remove a section that it wrote; raises SaveError for one that the user wrote."""

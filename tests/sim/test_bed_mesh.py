@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.modules.compensation.bed_mesh import PROFILES_MAX
 from coordinator.virtual_machine.plant_bed import BedSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.virtual.plant import Bed
@@ -224,11 +225,25 @@ def test_profiles_are_kept_saved_and_removed(tmp_path: Path) -> None:
     assert mapped(output)["z_positions"] == told["probed_matrix"]
 
 
+def test_profiles_have_a_limit_and_are_made_once_for_clients(tmp_path: Path) -> None:
+    """Failed before: any number, each written out again at every look and saved on the control loop."""
+    stage = stage_with(tmp_path)
+    names = [f"p{n}" for n in range(PROFILES_MAX)]
+    saves = [f"BED_MESH_PROFILE SAVE={name}" for name in (*names, "more")]
+    with pytest.raises(Exception, match=f"there are {PROFILES_MAX} profiles already"):
+        stage.do("G28", "G1 Z5 F900", "BED_MESH_CALIBRATE PROFILE=p0", *saves)
+    first, second = status(stage)["profiles"], status(stage)["profiles"]
+    assert [*first] == names
+    assert all(first[name] is second[name] for name in names)
+
+
 @pytest.mark.parametrize(
     ("line", "refused"),
     [
         ("BED_MESH_PROFILE LOAD=gone", "there is no 'gone'"),
         ("BED_MESH_PROFILE SAVE=x", "no mesh is followed"),
+        (f"BED_MESH_PROFILE SAVE={'n' * 101}", "cannot be a profile's name"),
+        ('BED_MESH_PROFILE SAVE="a  b"', "cannot be a profile's name"),
         ("BED_MESH_MAP", "no mesh is followed"),
         ("BED_MESH_CALIBRATE MESH_MIN=5", "two numbers"),
         ("BED_MESH_CALIBRATE PROBE_COUNT=9,9", "cannot be joined by lagrange"),

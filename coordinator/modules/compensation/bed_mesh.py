@@ -39,11 +39,12 @@ from coordinator.modules.levelling.points import ProbePoints, how_to_measure
 from coordinator.modules.probes.probe import Measured, Measuring, Probe
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.motion.steps.surface import Surface
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 DEFAULT_PROFILE: Final = "default"
+PROFILES_MAX: Final = 50
+"""That a program may make; clients get all of them."""
 RESTORE: Final = "_BED_MESH_RESTORE"
 
 
@@ -85,6 +86,8 @@ class BedMesh(Module):
         super().__init__(build)
         self.name = "bed_mesh"
         self.profiles: dict[str, Mesh] = {}
+        self._told: dict[str, Value] = {}
+        """They as front ends get them."""
         self._settings: MeshSettings | None = None
         self._points: ProbePoints | None = None
         self._limits = build.machine.limits
@@ -118,6 +121,7 @@ class BedMesh(Module):
         """Find the probe, without which the bed is probed by hand; raises NotSupported."""
         if self._points is not None:
             self._probe = self._points.find_probe(modules)
+        self._told = {name: _told(mesh) for name, mesh in self.profiles.items()}
         self._objects = modules.find("exclude_object", ExcludeObject)
 
     def status(self) -> Mapping[str, Value]:
@@ -129,7 +133,7 @@ class BedMesh(Module):
             "mesh_max": [0.0, 0.0] if mesh is None else [*mesh.maximum],
             "probed_matrix": [[]] if mesh is None else _rows(mesh.heights),
             "mesh_matrix": [[]] if mesh is None else self._fine,
-            "profiles": {name: _told(profile) for name, profile in self.profiles.items()},
+            "profiles": self._told,
         }
 
     # ------------------------------------------------------------------------------------------- following
@@ -268,6 +272,7 @@ class BedMesh(Module):
         given = command.only_parameters(PARAMETERS)
         grid, algorithm = self._wanted(command)
         profile = profile_name(command, given, "PROFILE") if "PROFILE" in given else DEFAULT_PROFILE
+        self._check_room(command, profile)
         by = None if how is None or self._probe is None else (self._probe, how)
         self._points.check(call, None if by is None else by[0])
         wanted_mesh = _Wanted(grid, algorithm, profile)
@@ -328,8 +333,13 @@ class BedMesh(Module):
 
     def _keep(self, name: str, mesh: Mesh) -> None:
         self.profiles = {**self.profiles, name: mesh}
-        if (live := self._live) is not None:
-            live.soon_on_loop(lambda: _save(live, name, mesh))
+        self._told = {**self._told, name: _told(mesh)}
+        if self._live is not None:
+            self._live.save_soon(f"bed_mesh {name}", profile_texts(mesh))
+
+    def _check_room(self, command: Command, name: str) -> None:
+        if name not in self.profiles and len(self.profiles) >= PROFILES_MAX:
+            raise WordError(f"{command.name}: there are {PROFILES_MAX} profiles already; remove one of them")
 
     # -------------------------------------------------------------------------------------- other commands
 
@@ -345,22 +355,25 @@ class BedMesh(Module):
         if "REMOVE" in given:
             name = one(call.command, given, "REMOVE", self.profiles)
             return Immediate(
-                (f"profile {name} is removed; SAVE_CONFIG removes it from the file",),
+                (f"profile {name} is removed",),
                 lambda: self._remove(name),
             )
         name, mesh = profile_name(call.command, given, "SAVE"), self._mesh
         if mesh is None:
             raise WordError("BED_MESH_PROFILE SAVE: no mesh is followed; probe one with BED_MESH_CALIBRATE")
+        self._check_room(call.command, name)
         return Immediate((f"profile {name} is saved; SAVE_CONFIG writes it",), lambda: self._keep(name, mesh))
 
     def _remove(self, name: str) -> None:
         self.profiles = {other: mesh for other, mesh in self.profiles.items() if other != name}
+        self._told = {other: told for other, told in self._told.items() if other != name}
         live = self._live
         if live is None:
             return
 
         def drop() -> None:
-            live.drop_saved(f"bed_mesh {name}")
+            if live.drop_saved(f"bed_mesh {name}"):
+                live.say(f"SAVE_CONFIG removes profile {name} from the file")
 
         live.soon_on_loop(drop)
 
@@ -421,11 +434,6 @@ class BedMesh(Module):
         if self._mesh is None:
             raise WordError(f"{call.command.name}: no mesh is followed; BED_MESH_CALIBRATE probes one")
         return self._mesh
-
-
-def _save(live: ModuleContext, name: str, mesh: Mesh) -> None:
-    for option, text in profile_texts(mesh).items():
-        live.save(f"bed_mesh {name}", option, text)
 
 
 def _pair(numbers: Sequence[Any]) -> Place:

@@ -24,6 +24,8 @@ from coordinator.modules.levelling.points import HEIGHT, TRAVEL_SPEED
 from coordinator.motion.steps.surface import NO_FADE
 from coordinator.support.quoting import shown
 
+NAME_MAX: Final = 100
+"""Characters of a profile's name."""
 POINTS_MAX: Final = 100
 """Along an axis."""
 REGIONS: Final = 20
@@ -406,8 +408,9 @@ def grid_for(command: Command, given: dict[str, str], grid: Grid) -> Grid:
 def profile_name(command: Command, given: dict[str, str], key: str) -> str:
     """Return the name of a profile to be saved; raises WordError."""
     name = given[key]
-    if not re.fullmatch(r"[\w.-][\w .-]*", name):
+    if not re.fullmatch(r"[\w.-][\w .-]*", name) or " ".join(name.split()) != name or len(name) > NAME_MAX:
         raise WordError(
-            f"{command.name}: {quoted(name)} cannot be a profile's name; take letters, digits, - and _"
+            f"{command.name}: {quoted(name)} cannot be a profile's name; take letters, digits, - and _,"
+            f" {NAME_MAX} at most"
         )
     return name
