@@ -16,7 +16,10 @@ from typing import Any, Final
 from coordinator.ipc.server.stop_lane import EncryptedTransport, FindStop
 from nodes.support.errors import CanductorError
 
-READ_BYTES: Final = 65_536
+READ_BYTES: Final = 16_384
+"""At a time: one record of the longest kind, or 700 of one byte, which take 1 to 2 ms."""
+READS_PER_ROUND: Final = 4
+"""Of all connections of a server, in one round of the loop; a handshake takes about 1 ms, too."""
 WAITING_MAX: Final = 262_144
 """Decrypted bytes that wait to be taken; then no more are read."""
 
@@ -25,10 +28,30 @@ def _nothing() -> None:
     pass
 
 
+class ReadTurns:
+    """Bounds what all connections of a server decrypt in one round of the loop that takes the turns."""
+
+    def __init__(self) -> None:
+        self._taken = 0
+
+    def take(self) -> bool:
+        """Return whether this round has a turn left, and take it."""
+        if self._taken == 0:
+            asyncio.get_running_loop().call_soon(self._begin_round)  # before what the next round finds ready
+        if self._taken >= READS_PER_ROUND:
+            return False
+        self._taken += 1
+        return True
+
+    def _begin_round(self) -> None:
+        self._taken = 0
+
+
 class TlsServer:
     """TLS 1.2 or later with the chain and key of two PEM files; raises CanductorError."""
 
     def __init__(self, certificate: Path, private_key: Path) -> None:
+        self._turns = ReadTurns()
         self._context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         self._context.minimum_version = ssl.TLSVersion.TLSv1_2
         try:
@@ -40,14 +63,18 @@ class TlsServer:
 
     def begin(self, opened: socket.socket) -> "TlsState":
         """Return the state of TLS over OPENED, a non-blocking socket of its own."""
-        return TlsState(opened, self._context)
+        return TlsState(opened, self._context, self._turns)
 
 
 class TlsState:
-    """The server's end of a TLS connection over OPENED, a non-blocking socket of its own; for any thread."""
+    """The server's end of a TLS connection over OPENED, a non-blocking socket of its own; for any thread.
 
-    def __init__(self, opened: socket.socket, context: ssl.SSLContext) -> None:
+    On the loop it reads in its TURNS.
+    """
+
+    def __init__(self, opened: socket.socket, context: ssl.SSLContext, turns: ReadTurns) -> None:
         self.context = context
+        self.turns = turns
         self.socket = opened
         self._lock = threading.RLock()
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -238,7 +265,8 @@ class TlsTransport(EncryptedTransport):
             self._loop.remove_reader(self._state.socket)
 
     def _readable(self) -> None:
-        self._state.receive()
+        if self._state.turns.take():  # else the loop finds it readable again in its next round
+            self._state.receive()
         self._deliver()
 
     def _deliver(self) -> None:

@@ -5,6 +5,7 @@ import random
 import socket
 import ssl
 from asyncio.selector_events import _SelectorTransport  # type: ignore[attr-defined]
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 
 from coordinator.ipc.server.tcp_listener import TcpListener
-from coordinator.ipc.server.tls_transport import TlsServer, TlsTransport
+from coordinator.ipc.server.tls_transport import READS_PER_ROUND, TlsServer, TlsState, TlsTransport
 from tests.stages import jump_loop
 
 MIB = 1 << 20
@@ -273,3 +274,48 @@ def test_what_is_known_of_it(certificate: tuple[Path, Path], name: str) -> None:
             assert known == writer.get_extra_info("sockname")
 
     run(certificate, body)
+
+
+def test_few_connections_are_decrypted_in_a_round_of_the_loop(
+    certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Failed before: all in one, a few ms for each that sends records of one byte, without a token."""
+    rounds, reads = 0, Counter[int]()
+    receive = TlsState.receive
+
+    def count(state: TlsState) -> bool:
+        reads[rounds] += 1
+        return receive(state)
+
+    def tick() -> None:
+        nonlocal rounds
+        rounds += 1
+        asyncio.get_running_loop().call_soon(tick)
+
+    async def main() -> None:
+        guests: list[Guest] = []
+
+        def make() -> Guest:
+            guests.append(Guest())
+            return guests[-1]
+
+        listener = TcpListener(make, TlsServer(*certificate))
+        await listener.open("127.0.0.1", 0)
+        trusting = ssl.create_default_context(cafile=str(certificate[0]))
+        opened = [await asyncio.open_connection(*listener.addresses[0], ssl=trusting) for _ in range(12)]
+        monkeypatch.setattr(TlsState, "receive", count)
+        tick()
+        for _, writer in opened:
+            for _ in range(100):
+                writer.write(b"x")
+        for guest in guests:
+            await guest.has(100)
+        for _, writer in opened:
+            writer.transport.abort()
+        for guest in guests:
+            await guest.lost
+        listener.close()
+
+    asyncio.run(main())
+    assert reads.total() >= 12
+    assert max(reads.values()) <= READS_PER_ROUND
