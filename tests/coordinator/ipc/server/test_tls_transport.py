@@ -71,19 +71,24 @@ class BufferedGuest(asyncio.BufferedProtocol):
 Body = Callable[[Guest, asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 
+async def listening(certificate: tuple[Path, Path]) -> tuple[TcpListener, list[Guest], ssl.SSLContext]:
+    """Return a server, the protocols of its connections, and what a client needs to trust it."""
+    guests: list[Guest] = []
+
+    def make() -> Guest:
+        guests.append(Guest())
+        return guests[-1]
+
+    listener = TcpListener(make, TlsServer(*certificate))
+    await listener.open("127.0.0.1", 0)
+    return listener, guests, ssl.create_default_context(cafile=str(certificate[0]))
+
+
 def run(certificate: tuple[Path, Path], body: Body) -> None:
     """Have BODY use a connection: the server's protocol, and the client's streams."""
 
     async def main() -> None:
-        guests: list[Guest] = []
-
-        def make() -> Guest:
-            guests.append(Guest())
-            return guests[-1]
-
-        listener = TcpListener(make, TlsServer(*certificate))
-        await listener.open("127.0.0.1", 0)
-        trusting = ssl.create_default_context(cafile=str(certificate[0]))
+        listener, guests, trusting = await listening(certificate)
         reader, writer = await asyncio.open_connection(*listener.addresses[0], ssl=trusting)
         while not guests:  # noqa: ASYNC110 (it tells nobody)
             await asyncio.sleep(0.001)
@@ -293,15 +298,7 @@ def test_few_connections_are_decrypted_in_a_round_of_the_loop(
         asyncio.get_running_loop().call_soon(tick)
 
     async def main() -> None:
-        guests: list[Guest] = []
-
-        def make() -> Guest:
-            guests.append(Guest())
-            return guests[-1]
-
-        listener = TcpListener(make, TlsServer(*certificate))
-        await listener.open("127.0.0.1", 0)
-        trusting = ssl.create_default_context(cafile=str(certificate[0]))
+        listener, guests, trusting = await listening(certificate)
         opened = [await asyncio.open_connection(*listener.addresses[0], ssl=trusting) for _ in range(12)]
         monkeypatch.setattr(TlsState, "receive", count)
         tick()
