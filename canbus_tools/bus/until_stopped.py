@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Final
 
-ENDING: Final = (signal.SIGTERM, signal.SIGHUP)
-"""End a program as Ctrl-C does; SIGHUP: its terminal is gone."""
-_SIGNALS: Final = (signal.SIGINT, *ENDING)
+from nodes.support.termination import TERMINATION
+
+_SIGNALS: Final = (signal.SIGINT, *TERMINATION)
 
 
 class StopFlag:

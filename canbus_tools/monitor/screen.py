@@ -14,13 +14,13 @@ from textual.containers import Vertical
 from textual.widgets import DataTable, Footer, Input, RichLog, Static
 
 from canbus_tools.bus.computer import Computer, Listener, now_s
-from canbus_tools.bus.until_stopped import ENDING
 from canbus_tools.monitor.bus_watch import BusRates, BusWatch, MonitorOptions
 from canbus_tools.monitor.text import COLUMNS, bar_line, cells, log_line
 from canbus_tools.protocol.decoded import Decoded, Kind
 from canbus_tools.protocol.filters import read_filter
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError
+from nodes.support.termination import TERMINATION
 
 REFRESH_S: Final = 0.25
 KEPT: Final = 20_000
@@ -97,7 +97,7 @@ class MonitorScreen(App[None]):
         log.focus()
         self.set_interval(REFRESH_S, self.refresh_now)
         # The command line's handlers would end the program before the terminal is restored.
-        for number in ENDING:
+        for number in TERMINATION:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 asyncio.get_running_loop().add_signal_handler(number, self._end_by, number)
 

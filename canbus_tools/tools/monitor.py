@@ -11,7 +11,7 @@ from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.bus.computer import Computer, Listener, now_s
 from canbus_tools.bus.open_bus import BITRATE_MAX, BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import BusTalk, refuse_if_in_use
-from canbus_tools.bus.until_stopped import ENDING, StopFlag, stop_flag
+from canbus_tools.bus.until_stopped import StopFlag, stop_flag
 from canbus_tools.discovery.inventory import take_inventory
 from canbus_tools.monitor.bus_watch import BusWatch, MonitorOptions
 from canbus_tools.monitor.screen import MonitorScreen
@@ -28,6 +28,7 @@ from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, decimal, options_from, parse_int
 from nodes.support.terminal import show, show_error
+from nodes.support.termination import TERMINATION
 
 FETCHED: Final = "fetched from the node"
 EVERY_NODE: Final = "all"
@@ -98,7 +99,7 @@ def run_monitor(computer: Computer, options: MonitorOptions) -> "MonitorReport":
 
 
 def _run_screen(screen: MonitorScreen) -> int:
-    before = {number: signal.getsignal(number) for number in ENDING}
+    before = {number: signal.getsignal(number) for number in TERMINATION}
     screen.run()
     for number, handler in before.items():
         signal.signal(number, handler)

@@ -12,11 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 from coordinator.cli.parser import Job, build_parser, parse_command_line
 from coordinator.support.bug_log import log_bug
-from coordinator.support.interrupts import TERMINATION, Terminated
+from coordinator.support.interrupts import Terminated
 from coordinator.support.report import Report
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import ParserExit, UsageError
 from nodes.support.terminal import OutputError, discard, replace_closed_outputs, show, show_error
+from nodes.support.termination import TERMINATION
 
 EXIT_OK = 0
 EXIT_FAILED = 1

@@ -9,8 +9,8 @@ from typing import Final
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.machine_service import MachineService
-from coordinator.support.interrupts import TERMINATION
 from coordinator.support.loop_watchdog import LoopWatchdog, WatchedLoop
+from nodes.support.termination import TERMINATION
 
 SIGNALS: Final = frozenset((signal.SIGINT, *TERMINATION))
 

@@ -39,7 +39,7 @@ class Thumbnail:
 def thumbnails(head: bytes) -> list[Thumbnail]:
     """Return the pictures in HEAD, a program's first HEAD_BYTES bytes, the smallest first.
 
-    Each line is looked at once, and no step of it takes long: a thread may do it beside the control loop.
+    Each line is read once, in short steps of Python: a thread may do it while the control loop runs.
     """
     found = []
     begin: re.Match[bytes] | None = None

@@ -6,11 +6,9 @@ from collections.abc import Callable, Coroutine
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
+from nodes.support.termination import TERMINATION
+
 T = TypeVar("T")
-
-
-TERMINATION: Final = (signal.SIGTERM, signal.SIGHUP)
-"""Signals that end a command as Ctrl-C does; SIGHUP: its terminal is gone."""
 
 
 class Terminated(KeyboardInterrupt):

@@ -217,22 +217,22 @@ class WebServer:
 
     def _serve_file(self, request: web.BaseRequest) -> web.Response:
         if request.method not in ("GET", "HEAD"):
-            return web.Response(status=405, headers={**HEADERS, "Allow": "GET, HEAD"})
+            return web.Response(status=405, headers={"Allow": "GET, HEAD"})
         if request.path == SESSION_PATH:
-            return web.Response(status=204 if self._session_of(request.headers) else 401, headers=HEADERS)
+            return web.Response(status=204 if self._session_of(request.headers) else 401)
         file = self._files.get(request.path)
         if file is None:
-            return web.Response(status=404, text="there is no such page\n", headers=HEADERS)
+            return web.Response(status=404, text="there is no such page\n")
         return _send(file, request)
 
     async def _sign_in(self, request: web.BaseRequest) -> web.Response:
         """Give a session for the code of a link, or for a token."""
         if request.method != "POST":
-            return web.Response(status=405, headers={**HEADERS, "Allow": "POST"})
+            return web.Response(status=405, headers={"Allow": "POST"})
         if not is_own_origin(request.headers.get("Origin"), request.headers.get("Host", "")):
             return self._refuse("only the page of this server may sign in here")
         if request.content_length is None or request.content_length > LOGIN_BYTES_MAX:
-            return web.Response(status=413, headers=HEADERS)
+            return web.Response(status=413)
         given = _read_login(await request.read())
         if given is None:
             return _fault(HTTPStatus.BAD_REQUEST, ApiError("bad_message", "token and keep are needed"))
@@ -249,7 +249,7 @@ class WebServer:
             self._access.sign_out(former)
         signed_in = self._access.sign_in(_host(request.headers), scope, digest, time.time())
         await self._save_sessions()
-        headers = {**HEADERS, "Cache-Control": "no-store"}
+        headers = {"Cache-Control": "no-store"}
         answer = web.json_response({"key": signed_in.key, "scope": scope.word}, headers=headers)
         answer.set_cookie(
             self._cookie_name,
@@ -265,15 +265,15 @@ class WebServer:
     async def _stop(self, request: web.BaseRequest) -> web.Response:
         """Carry out an emergency stop that is a request of its own."""
         if request.method != "POST":
-            return web.Response(status=405, headers={**HEADERS, "Allow": "POST"})
+            return web.Response(status=405, headers={"Allow": "POST"})
         if request.content_length is None or request.content_length > BODY_BYTES_MAX:
-            return web.Response(status=413, headers=HEADERS)
+            return web.Response(status=413)
         judged = self._judge_stop(request.headers, await request.read(), _address(request))
         if isinstance(judged, Refusal):
             self._refused += 1
             return _fault(judged.status, judged.error)
         # No await from here to the answer: the stop lane would find the stop again.
-        return web.json_response(judged.carry_out(), headers={**HEADERS, "Cache-Control": "no-store"})
+        return web.json_response(judged.carry_out(), headers={"Cache-Control": "no-store"})
 
     def _judge_stop(self, headers: MultiMapping[str], body: bytes, address: str) -> StopCall | Refusal:
         """Return what a stop with HEADERS and BODY from ADDRESS does; in any thread.
@@ -310,7 +310,7 @@ class WebServer:
 
     def _refuse(self, sentence: str) -> web.Response:
         self._refused += 1
-        return web.Response(status=403, text=sentence + "\n", headers=HEADERS)
+        return web.Response(status=403, text=sentence + "\n")
 
     async def _serve_socket(self, request: web.BaseRequest) -> web.StreamResponse:
         if not is_own_origin(request.headers.get("Origin"), request.headers.get("Host", "")):
@@ -319,11 +319,11 @@ class WebServer:
             max_msg_size=self._ipc.limits.message_bytes, heartbeat=HEARTBEAT_S, compress=False
         )
         if not socket.can_prepare(request).ok:
-            return web.Response(status=426, headers={**HEADERS, "Upgrade": "websocket"})
+            return web.Response(status=426, headers={"Upgrade": "websocket"})
         session = self._session_of(request.headers)
         if session is None:
             self._refused += 1
-            return web.Response(status=401, text="sign in first\n", headers=HEADERS)
+            return web.Response(status=401, text="sign in first\n")
         if self._access.note_use(session, time.time()):
             await self._save_sessions()
         socket.headers.update(HEADERS)
@@ -407,13 +407,11 @@ def _read_login(body: bytes) -> tuple[str, bool] | None:
 
 
 def _fault(status: HTTPStatus, error: ApiError) -> web.Response:
-    return web.json_response(
-        {"code": error.code, "message": error.sentence}, status=status.value, headers=HEADERS
-    )
+    return web.json_response({"code": error.code, "message": error.sentence}, status=status.value)
 
 
 def _send(file: PageFile, request: web.BaseRequest) -> web.Response:
-    headers = {**HEADERS, "ETag": file.tag, "Content-Type": file.content_type, "Vary": "Accept-Encoding"}
+    headers = {"ETag": file.tag, "Content-Type": file.content_type, "Vary": "Accept-Encoding"}
     if request.headers.get("If-None-Match") == file.tag:
         return web.Response(status=304, headers=headers)
     if "gzip" in request.headers.get("Accept-Encoding", ""):

@@ -27,9 +27,9 @@ from coordinator.ipc.discovery.multicast import (
     open_mdns,
     reachable_addresses,
 )
-from coordinator.support.interrupts import TERMINATION
 from nodes.support.errors import CanductorError
 from nodes.support.terminal import show
+from nodes.support.termination import TERMINATION
 
 RESCAN_S: Final = 10.0
 """Between checks whether this computer's addresses are still the same."""

@@ -86,8 +86,8 @@ class BedMesh(Module):
         super().__init__(build)
         self.name = "bed_mesh"
         self.profiles: dict[str, Mesh] = {}
-        self._told: dict[str, Value] = {}
-        """They as front ends get them."""
+        self._shown: dict[str, Value] = {}
+        """The same as front ends get them."""
         self._settings: MeshSettings | None = None
         self._points: ProbePoints | None = None
         self._limits = build.machine.limits
@@ -121,7 +121,7 @@ class BedMesh(Module):
         """Find the probe, without which the bed is probed by hand; raises NotSupported."""
         if self._points is not None:
             self._probe = self._points.find_probe(modules)
-        self._told = {name: _told(mesh) for name, mesh in self.profiles.items()}
+        self._shown = {name: _as_status(mesh) for name, mesh in self.profiles.items()}
         self._objects = modules.find("exclude_object", ExcludeObject)
 
     def status(self) -> Mapping[str, Value]:
@@ -133,7 +133,7 @@ class BedMesh(Module):
             "mesh_max": [0.0, 0.0] if mesh is None else [*mesh.maximum],
             "probed_matrix": [[]] if mesh is None else _rows(mesh.heights),
             "mesh_matrix": [[]] if mesh is None else self._fine,
-            "profiles": self._told,
+            "profiles": self._shown,
         }
 
     # ------------------------------------------------------------------------------------------- following
@@ -333,7 +333,7 @@ class BedMesh(Module):
 
     def _keep(self, name: str, mesh: Mesh) -> None:
         self.profiles = {**self.profiles, name: mesh}
-        self._told = {**self._told, name: _told(mesh)}
+        self._shown = {**self._shown, name: _as_status(mesh)}
         if self._live is not None:
             self._live.save_soon(f"bed_mesh {name}", profile_texts(mesh))
 
@@ -366,7 +366,7 @@ class BedMesh(Module):
 
     def _remove(self, name: str) -> None:
         self.profiles = {other: mesh for other, mesh in self.profiles.items() if other != name}
-        self._told = {other: told for other, told in self._told.items() if other != name}
+        self._shown = {other: shown for other, shown in self._shown.items() if other != name}
         live = self._live
         if live is None:
             return
@@ -453,7 +453,7 @@ def _rows(heights: Heights) -> list[Value]:
     return [[round(height, 6) for height in row] for row in heights]
 
 
-def _told(mesh: Mesh) -> dict[str, Value]:
+def _as_status(mesh: Mesh) -> dict[str, Value]:
     return {
         "points": _rows(mesh.heights),
         "mesh_params": _parameters(mesh),

@@ -55,7 +55,9 @@ def test_each_answer_has_the_headers_and_names_no_library() -> None:
 
     async def main() -> None:
         failures: list[str] = []
-        asyncio.get_running_loop().set_exception_handler(lambda _, told: failures.append(told["message"]))
+        asyncio.get_running_loop().set_exception_handler(
+            lambda _, context: failures.append(context["message"])
+        )
         server = HttpServer(fail, connections_max=8, connection_s=30.0)
         await server.open("127.0.0.1", 0)
         for line, headers, status in (
@@ -68,10 +70,10 @@ def test_each_answer_has_the_headers_and_names_no_library() -> None:
             ("GET /200 HTTP/1.1", "a: \0\r\n", 400),
         ):
             request = f"{line}\r\nHost: localhost\r\n{headers}Connection: close\r\n\r\n{{}}"
-            told = await send(server, request.encode())
-            lines = told.decode().split("\r\n")
-            assert int(lines[0].split()[1]) == status, told
-            assert "aiohttp" not in told.decode()
+            answer = await send(server, request.encode())
+            lines = answer.decode().split("\r\n")
+            assert int(lines[0].split()[1]) == status, answer
+            assert "aiohttp" not in answer.decode()
             assert {f"{name}: {value}" for name, value in HEADERS.items()} <= set(lines)
         assert failures == [
             f"canductor: the answer to GET '{path}' failed by a mistake of the program"
@@ -159,8 +161,8 @@ def test_what_the_page_has_no_use_for_is_not_parsed(
 
     async def go(server: HttpServer) -> None:
         rounds = Rounds(monkeypatch)
-        (told,) = {(await send(server, data[:HEAD_BYTES_MAX]))[:12] for _ in range(2)}
-        assert told == f"HTTP/1.1 {status}".encode()
+        (answer,) = {(await send(server, data[:HEAD_BYTES_MAX]))[:12] for _ in range(2)}
+        assert answer == f"HTTP/1.1 {status}".encode()
         await asyncio.gather(*(send(server, data) for _ in range(8)))
         assert rounds.end() == []
         assert server.refused == 10
