@@ -3,7 +3,8 @@
     python -m tests.soak.run [--minutes M]
 
 At the end of each print, when no client is there but the one that starts the prints, memory, descriptors and
-threads of the service are measured. Exit status 1: a print did not succeed, or one of them grows.
+threads of the service are measured. Exit status 1: a print did not succeed, or one of them grows. Of a print
+that did not succeed, what the nodes report and who had to wait for a processor meanwhile is shown.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from typing import Any, Final
 from coordinator.ipc.client.client import Client
 from nodes.support.errors import CanductorError
 from tests.soak.footprint import Footprint, growth, of_process, problems
+from tests.soak.waiting import command_of, family, waited_s
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 CLIENTS: Final = 4
@@ -31,6 +33,8 @@ PRINT_S: Final = 120.0
 """A print that takes longer hangs; it takes some four seconds of motion."""
 SETTLE_S: Final = 0.5
 """So long after the clients have gone the server has closed what they used."""
+OUTPUT_MAX: Final = 4000
+"""Characters of the service's output that are shown after a failure, the last ones."""
 
 
 def job(prints: int) -> str:
@@ -107,6 +111,18 @@ async def one_print(client: Client, address: str, folder: Path, number: int) -> 
     return sum(visits)
 
 
+async def explain(client: Client, began_s: float, before: dict[int, float]) -> str:
+    """Return what may say why the print begun at BEGAN_S failed; BEFORE: ``waited_s`` of each process."""
+    took_s = time.monotonic() - began_s
+    waits = [f"{command_of(pid)} {waited_s(pid) - then_s:.3f} s" for pid, then_s in before.items()]
+    lines = [f"waited for a processor in the {took_s:.3f} s of this print: {', '.join(waits)}"]
+    try:
+        state = await client.call("state.get", {"fields": ["machine.*", "nodes.*"]})
+    except CanductorError as error:
+        return "\n".join([*lines, f"the service does not answer: {error}"])
+    return "\n".join([*lines, *(f"{field}: {value}" for field, value in sorted(state["values"].items()))])
+
+
 async def soak(pid: int, folder: Path, minutes: float) -> tuple[list[Footprint], int]:
     """Print for MINUTES; return a footprint after each print, and how many visits there were."""
     address = f"unix:{folder / 'soak.sock'}"
@@ -121,7 +137,12 @@ async def soak(pid: int, folder: Path, minutes: float) -> tuple[list[Footprint],
                 if update.values.get("machine.state") == "ready":
                     break
         while time.monotonic() < until_s:
-            visits += await one_print(client, address, folder, len(samples))
+            began_s, waited = time.monotonic(), {one: waited_s(one) for one in family(pid)}
+            try:
+                visits += await one_print(client, address, folder, len(samples))
+            except (CanductorError, TimeoutError):
+                sys.stdout.write(f"{await explain(client, began_s, waited)}\n")
+                raise
             samples.append(of_process(pid))
     return samples, visits
 
@@ -139,7 +160,7 @@ def main(arguments: list[str] | None = None) -> int:
                 samples, visits = asyncio.run(soak(process.pid, folder, minutes))
                 found = problems("the service", samples)
             except (CanductorError, TimeoutError, OSError, ValueError) as error:
-                sys.stdout.write(f"{(folder / 'output').read_text()[-2000:]}\nFAILED: {error}\n")
+                sys.stdout.write(f"{(folder / 'output').read_text()[-OUTPUT_MAX:]}\nFAILED: {error}\n")
                 return 1
         if process.returncode:
             found.append(f"the service ended with {process.returncode}")
