@@ -27,8 +27,8 @@ SETTLE_ROUNDS: Final = 40
 SETTLE_INTERVAL_S: Final = 0.05
 INTERVAL_S: Final = 0.933
 """Not a divisor of a second: periodic work on a node must not meet every pulse."""
-SLACK: Final = 0.1
-"""By how much of the time between two pulses the next may be later."""
+SLACK: Final = 0.35
+"""By how much of the time between two pulses the next may be later; as that of the samples of clocks."""
 IDLE_S: Final = 0.25
 """Interval of the checks for two capable nodes."""
 ANSWER_TIMEOUT_S: Final = 0.2

@@ -15,8 +15,9 @@ CLOCK: Final = Query("get_clock", "clock")
 UPTIME: Final = Query("get_uptime", "uptime")
 REST_INTERVAL_S: Final = 4.0
 """At least, between two samples of a clock that is known while nothing needs it closely."""
-SLACK: Final = 0.1
-"""By how much of the time between two samples the next may be later."""
+SLACK: Final = 0.35
+"""By how much of the time between two samples the next may be later: what sensors report every 0.3 s wakes
+the host meanwhile."""
 
 _BROKEN: Final = (
     f"its clock is unusable: {BROKEN} readings in a row contradict the estimate and each other; check"

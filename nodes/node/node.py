@@ -46,11 +46,12 @@ CLOCK_TIMEOUT_S: Final = 15.0
 MEASURED: Final = "analog_in_state"
 STATE: Final = ("config", "uptime", "clock", "sync_pulse")
 PATIENCE_S: Final = {
-    **dict.fromkeys(STATE, 0.1),
+    **dict.fromkeys(STATE, 0.32),
     "stats": 1.0,
     MEASURED: 0.005,  # the sensors of a node report together; a heater is controlled by what they say
 }
-"""How long responses that come all the time may wait until something else wakes the host."""
+"""How long responses that come all the time may wait until something else wakes the host; what is asked of a
+node waits for the next report of its heaters' sensors, every 0.3 s."""
 REST_PATIENCE_S: Final = 1.0
 """The same of what sensors measure while nothing acts on it, and of a node's state while all is at rest."""
 
