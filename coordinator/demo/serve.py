@@ -9,20 +9,27 @@ from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
 from coordinator.demo.run import DemoOptions
 from coordinator.front_ends.serve import ServeOptions, serve
-from coordinator.support.examples import DEMO_GCODE
+from coordinator.support.examples import DEMO_GCODE, EXAMPLES
 from coordinator.support.report import Report
 from coordinator.virtual_machine.virtual_machine import VirtualMachine
 
 
 def serve_demo(options: DemoOptions, serving: ServeOptions) -> Report:
     """Serve until Ctrl-C or SIGTERM; raises CanductorError."""
-    description = load_machine(str(options.machine))
-    with (
-        tempfile.TemporaryDirectory(prefix="canductor-demo-") as folder,
-        VirtualMachine(description, dataclasses.replace(options, logs=False), Path(folder)) as stage,
-    ):
-        serving = dataclasses.replace(serving, state=Path(folder) / "state")
-        return serve(lambda: stage.description, with_jobs(serving, description, Path(folder)))
+    with tempfile.TemporaryDirectory(prefix="canductor-demo-") as name:
+        folder = Path(name)
+        machine = str(to_change(options.machine, folder))
+        description = load_machine(machine)
+        serving = dataclasses.replace(serving, state=folder / "state")
+        with VirtualMachine(description, dataclasses.replace(options, logs=False), folder) as stage:
+            return serve(lambda: stage.of(load_machine(machine)), with_jobs(serving, description, folder))
+
+
+def to_change(machine: Path, folder: Path) -> Path:
+    """Return the file MACHINE, or of an example a copy in FOLDER: SAVE_CONFIG writes into it."""
+    if not machine.resolve().is_relative_to(EXAMPLES.resolve()):
+        return machine
+    return Path(shutil.copy(machine, folder / "machine.cfg"))
 
 
 def with_jobs(options: ServeOptions, description: MachineDescription, folder: Path) -> ServeOptions:

@@ -81,9 +81,7 @@ class VirtualMachine:
         self._stack = ExitStack()
         self._described = description
         self._plants = machine_plants(description, _plant_settings(description, options))
-        self.description = dataclasses.replace(
-            description, nodes=tuple(self._virtual(node) for node in description.nodes)
-        )
+        self.description = self.of(description)
         """The machine with its connections replaced by virtual ones."""
 
     def _check_names(self, description: MachineDescription) -> None:
@@ -101,6 +99,22 @@ class VirtualMachine:
                 raise CanductorError("the machine has no CAN bus; leave --socketcan out")
             if name and name not in buses:
                 raise CanductorError(f"the machine has no CAN bus '{name}'; it has {', '.join(buses)}")
+
+    def of(self, description: MachineDescription) -> MachineDescription:
+        """Return DESCRIPTION, perhaps changed since the start, with its connections replaced by virtual ones.
+
+        Raises CanductorError when its nodes are others than those that were started.
+        """
+        before, now = (
+            {node.name: node.connection for node in nodes}
+            for nodes in (self._described.nodes, description.nodes)
+        )
+        if changed := [name for name in before | now if before.get(name) != now.get(name)]:
+            raise CanductorError(
+                f"node '{changed[0]}' is not connected as when the virtual hardware was started; end the"
+                " program and start it again"
+            )
+        return dataclasses.replace(description, nodes=tuple(map(self._virtual, description.nodes)))
 
     # ------------------------------------------------------------------------------------------ set up
 
