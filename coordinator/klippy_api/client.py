@@ -70,6 +70,13 @@ class Client:
             self.dropped += 1
             raise
 
+    def next_urgent(self) -> Request | None:
+        """Return the next call that may stop the machine; None: there is none. Raises TooLongError."""
+        while (urgent := self._framer.next_urgent()) is not None:
+            with contextlib.suppress(UnreadableError):
+                return read_request(urgent)
+        return None
+
     def unread_calls(self, unread: bytes) -> list[Request]:
         """Return the calls that may stop the machine, of those that wait and in UNREAD; in any thread."""
         found = []

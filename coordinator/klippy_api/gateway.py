@@ -39,6 +39,8 @@ OUTPUT_BYTES_MAX: Final = 4_194_304
 """A client with more unread is disconnected."""
 BLOCKED_S: Final = 5.0
 """A client that reads nothing for so long is disconnected."""
+LAST_MAX: Final = 64
+"""Messages that look like stops and are looked at after their client has left."""
 LINES_MAX: Final = 1_000
 """Of g-code's answers that wait to be sent together; of more the first are left out."""
 
@@ -76,10 +78,11 @@ class Connection(asyncio.BufferedProtocol):
         self._gateway.watch_stops(self, opened)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the client; what it has begun goes on."""
+        """Forget the client, after a stop that waits for its turn; what it has begun goes on."""
         del exc
         if self._blocked is not None:
             self._blocked.cancel()
+        self._gateway.carry_out_stop(self)
         self._scheduler.remove(self)
         self._gateway.forget(self)
 
@@ -282,11 +285,21 @@ class Gateway:
         with doing(overtaken=request.overtaken):
             self._begin(connection, request)
 
+    def carry_out_stop(self, connection: Connection) -> None:
+        """Stop the machine if CONNECTION, which is over, has asked for that and nobody has read it."""
+        with contextlib.suppress(TooLongError):
+            for _ in range(LAST_MAX):
+                request = connection.client.next_urgent()
+                if request is None:
+                    return
+                if self.endpoints.stops(request) is not None:
+                    self.call(connection, request)
+                    return
+
     def _begin(self, connection: Connection, request: Request) -> None:
         client = connection.client
-        if request.method != "emergency_stop" and (
-            client.running >= RUNNING_MAX or len(self._tasks) >= CALLS_MAX
-        ):
+        full = client.running >= RUNNING_MAX or len(self._tasks) >= CALLS_MAX
+        if full and self.endpoints.stops(request) is None:
             self._fail(connection, request, "too many requests are being done; wait for their answers")
             return
         try:

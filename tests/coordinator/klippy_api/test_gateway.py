@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from coordinator.klippy_api import script
+from coordinator.klippy_api.client import RUNNING_MAX
 from coordinator.klippy_api.gateway import BLOCKED_S, CLIENTS_MAX
 from coordinator.klippy_api.step_dump import StepDump
 from coordinator.klippy_api.wire import MESSAGE_BYTES_MAX
@@ -601,6 +602,36 @@ def test_a_stop_while_a_script_waits_for_its_turn_is_not_undone_by_it(tmp_path: 
             other.send("emergency_stop")
             assert "emergency stop" in (await client.answer(restart))["error"]["message"]
             await client.updates(1.0)
+            assert str(served.service.state) == "shutdown"
+
+    printer.serve(main)
+
+
+def test_a_stop_in_a_script_does_not_count_among_what_runs(tmp_path: Path) -> None:
+    """Failed before: it was one request too many, of this client or of all."""
+    printer = Printer(tmp_path, PRINTING)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client = api.connect()
+            for _ in range(RUNNING_MAX + 1):
+                last = client.send("gcode/script", {"script": "G4 P9000"})
+            assert "too many requests" in (await client.answer(last))["error"]["message"]
+            await client.script("M112")
+            assert str(served.service.state) == "shutdown"
+
+    printer.serve(main)
+
+
+def test_a_stop_that_waits_for_its_turn_outlives_its_client(tmp_path: Path) -> None:
+    """Failed before: it was forgotten with the connection."""
+    printer = Printer(tmp_path, PRINTING)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client = api.connect()
+            client.connection.client.receive(b'{"method":"M112"}\x03{"method":\x03"M112"\x03' + STOP)
+            client.connection.connection_lost(BrokenPipeError())
             assert str(served.service.state) == "shutdown"
 
     printer.serve(main)
