@@ -81,6 +81,8 @@ class AnnouncerProcess:
                 self._report(f"announcing the machine ended; it starts again in {RESTART_S:g} s")
             except OSError as error:
                 self._report(f"the machine cannot be announced: {error.strerror or error}")
+            except ValueError:  # it was killed in the middle of a line
+                self._report(f"announcing the machine failed; it starts again in {RESTART_S:g} s")
             await asyncio.sleep(RESTART_S)
 
     async def _run(self, process: asyncio.subprocess.Process) -> None:

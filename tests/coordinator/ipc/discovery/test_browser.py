@@ -283,6 +283,27 @@ def test_a_process_that_ends_is_begun_again_with_the_state_of_now() -> None:
     jump_loop.run(main())
 
 
+def test_a_process_that_is_killed_in_the_middle_of_a_line_is_begun_again() -> None:
+    async def main() -> None:
+        network, said, processes = MemoryNetwork(), list[str](), list[MemoryProcess]()
+
+        async def launch(bound: list[str]) -> "Process":
+            processes.append(MemoryProcess(network, bound))
+            return cast("Process", processes[-1])
+
+        announcer = AnnouncerProcess(machine("mini"), ["127.0.0.1"], said.append, launch=launch)
+        announcer.start()
+        await asyncio.sleep(UPDATE_SPACING_S)
+        processes[0].stdout.feed_data(b'"announced as')
+        processes[0].kill()
+        await asyncio.sleep(RESTART_S + UPDATE_SPACING_S)
+        assert len(processes) == 2
+        await announcer.close()
+        assert said[1] == f"announcing the machine failed; it starts again in {RESTART_S:g} s"
+
+    jump_loop.run(main())
+
+
 # ---------------------------------------------------------------------------------------------- browsing
 
 
