@@ -205,7 +205,7 @@ class WebServer:
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         if not is_known_host(request.headers.get("Host", ""), self._names):
-            name = repr(request.host)
+            name = repr(request.headers.get("Host", ""))  # aiohttp's own looks for this host's in the DNS
             return self._refuse(f"{name} is not a name of this page; use its IP address, or give --web-name")
         if request.path == SOCKET_PATH:
             return await self._serve_socket(request)
