@@ -172,6 +172,49 @@ def test_where_z_is_not_known_it_asks(tmp_path: Path) -> None:
     printer.serve(first, second)
 
 
+def test_one_that_ends_again_on_its_way_is_known_but_not_where_it_stands(tmp_path: Path) -> None:
+    """Failed before: it was forgotten, or the height where it had stood at first was taken for granted."""
+    printer, lines = Printer(tmp_path, SECTIONS), list[object]()
+
+    async def first(stage: Served) -> None:
+        await print_until(printer, stage, 0.65, 1.0)
+
+    async def on_its_way_up(stage: Served) -> None:
+        lines.append(stage.tree.get("job.interrupted_line"))
+        recovering = asyncio.ensure_future(stage.call("job.recover", home=True))
+        await stage.until(lambda: height(printer) > 2, "the head to go up")
+        recovering.cancel()
+
+    async def on_its_way_down(stage: Served) -> None:
+        lines.append(stage.tree.get("job.interrupted_line"))
+        with pytest.raises(ApiError, match="or has since, so Z is not known"):
+            await stage.call("job.recover", home=True)
+        await stage.call("job.recover", home=True, z=printer.true_mm("z"))
+
+    async def last(stage: Served) -> None:
+        lines.append(stage.tree.get("job.interrupted_line"))
+        with pytest.raises(ApiError, match="so Z is not known"):
+            await stage.call("job.recover", home=True)
+
+    printer.serve(first, on_its_way_up, on_its_way_down, last)
+    assert lines[0]
+    assert lines == [lines[0]] * 3
+
+
+def test_a_height_counts_only_until_z_moves(tmp_path: Path) -> None:
+    printer = Printer(tmp_path, SECTIONS + "[force_move]\nenable_force_move: True\n")
+
+    async def first(stage: Served) -> None:
+        await print_until(printer, stage, 0.65, 1.0)
+
+    async def second(stage: Served) -> None:
+        await gcode(stage, "FORCE_MOVE STEPPER=stepper_z DISTANCE=3 VELOCITY=5")
+        with pytest.raises(ApiError, match="or has since, so Z is not known"):
+            await stage.call("job.recover", home=True)
+
+    printer.serve(first, second)
+
+
 BENT = """
 [bed_mesh]
 mesh_min: 0, 0

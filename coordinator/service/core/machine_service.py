@@ -439,7 +439,7 @@ class MachineService:
         motion.toolpath.clear()
         self.job = JobRun(motion, work, self.now_s)
         self.job.lines_fed = 0 if fed else None
-        self.recovery.begin(self.job, work.program)
+        self.recovery.begin(self.job, work)
         self.log.add("job", f"{self.job.file}: started")
         self.look()
         return self.job

@@ -74,7 +74,7 @@ def read_journal(path: Path) -> Interrupted | None:
         if entry.get("ended"):
             head = None
         elif "file" in entry:
-            head, last = entry, {}
+            head, last = entry, goes_on if isinstance(goes_on := entry.get("goes_on"), dict) else {}
         else:
             last = entry
     return None if head is None else _interrupted(head, last)
@@ -157,6 +157,12 @@ class Journal:
         """Begin with a job; FED: one whose lines come from a client."""
         head = {"journal": _VERSION, "file": file, "size": size_bytes, "modified_ns": modified_ns}
         self._put(head | ({"fed": True} if fed else {}))
+
+    def go_on(self, found: Interrupted) -> None:
+        """Begin with a job that was interrupted as FOUND says; that counts until the first ``note``."""
+        head = {"journal": _VERSION, "file": found.file, "size": found.size_bytes}
+        where = {**found.held, "line": found.line}
+        self._put(head | {"modified_ns": found.modified_ns, "goes_on": where})
 
     def note(self, line: int, held: Mapping[str, Any]) -> None:
         """Record that LINE is being executed, and the settings that hold there."""

@@ -6,6 +6,7 @@ and what was hot can be made hot again. The line that was being carried out is c
 
 import asyncio
 import contextlib
+import dataclasses
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +17,6 @@ from coordinator.gcode.builtins.state import come_back
 from coordinator.gcode.commands import Recovering
 from coordinator.gcode.events import Event, Full, Notice
 from coordinator.gcode.parser import WordError, command_line
-from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.base import Module
 from coordinator.modules.compensation.bed_mesh import RESTORE, BedMesh
@@ -179,15 +179,21 @@ class Recovery:
             self._journal.close()
             self._journal = None
 
-    def begin(self, job: JobRun, program: Program) -> None:
-        """Keep the journal of JOB."""
+    def begin(self, job: JobRun, work: FileWork) -> None:
+        """Keep the journal of JOB, which does WORK."""
         self._job, self._noted_s, self._last = job, 0.0, None
         self._kept = _Kept(self._service.up_machine().modules)
-        self._modified_ns = program.modified_ns
+        self._modified_ns = work.program.modified_ns
         self._show(None)
-        if self._journal is not None:
+        if isinstance(work, RecoverWork):  # until it is there, it is interrupted where it was
+            self._last = Interrupted(
+                job.file, job.size_bytes, self._modified_ns, work.line, {**(work.held or {}), "z": None}
+            )
+            if self._journal is not None:
+                self._journal.go_on(self._last)
+        elif self._journal is not None:
             fed = job.lines_fed is not None
-            self._journal.begin(job.file, job.size_bytes, program.modified_ns, fed=fed)
+            self._journal.begin(job.file, job.size_bytes, self._modified_ns, fed=fed)
 
     def look(self) -> None:
         """Write down how far the job is."""
@@ -253,8 +259,10 @@ class Recovery:
         with contextlib.ExitStack() as unless_done:
             unless_done.callback(work.program.close)
             assert work.reached is not None
-            way = self._homing_plan(how, found, motion, work.reached.part_mm)
+            moved = await self._z_has_moved()
+            way = self._homing_plan(how, found, motion, work.reached.part_mm, moved=moved)
             await self._do(found, LinesWork(hot or ["M400"], name="recover"))
+            self._forget_height(found)
             if way.z_mm is not None:
                 await self._do(found, TakeHeight((), "recover", z_mm=way.z_mm))
             if way.up_mm is not None and way.up_mm > motion.planned.state.toolhead_position[2]:
@@ -270,6 +278,19 @@ class Recovery:
             job = service.start_job(work)
             unless_done.pop_all()
         return job
+
+    async def _z_has_moved(self) -> bool:
+        """Return whether motors that move Z have made steps since their nodes were started."""
+        machine = self._service.up_machine()
+        counts = await machine.query_stepper_counts()
+        return any(counts[motor.name] for motor in machine.description.motors if motor.weights[2])
+
+    def _forget_height(self, found: Interrupted) -> None:
+        """Have nobody rely on where the head stood when FOUND was interrupted: from now on it moves."""
+        found = dataclasses.replace(found, held={**found.held, "z": None})
+        self._show(found)
+        if self._journal is not None:
+            self._journal.go_on(found)
 
     async def _do(self, found: Interrupted, work: Work) -> None:
         queued = await self._service.ready_motion().do(work)
@@ -304,9 +325,11 @@ class Recovery:
         return found, motion
 
     def _homing_plan(
-        self, how: Recovering, found: Interrupted, motion: Motion, part_mm: float
+        self, how: Recovering, found: Interrupted, motion: Motion, part_mm: float, *, moved: bool
     ) -> ResumeHomingPlan:
-        z_mm = sure_height(found.held.get("z")) if how.z_mm is None else how.z_mm
+        z_mm = how.z_mm
+        if z_mm is None and not moved:
+            z_mm = sure_height(found.held.get("z"))
         if z_mm is not None and how.z_mm is None and isinstance(bed_mm := found.held.get("bed_mm"), float):
             z_mm += bed_mm
         machine = self._service.up_machine()

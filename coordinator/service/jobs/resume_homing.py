@@ -67,8 +67,8 @@ def plan_resume_homing(
     if "Z" in missing and z_mm is None:
         raise ApiError(
             "not_ready",
-            f"the head was going up or down when it was interrupted, so Z is not known: {home}, or say with z"
-            " where the head stands",
+            f"the head was going up or down when it was interrupted, or has since, so Z is not known: {home},"
+            " or say with z where the head stands",
         )
     up_mm = min(part_mm + LIFT_MM, described.limits.position_max[2])
     return ResumeHomingPlan(z_mm if "Z" in missing else None, up_mm, around)

@@ -42,6 +42,19 @@ def test_a_new_job_makes_the_old_one_forgotten(tmp_path: Path) -> None:
     assert found.line == 2
 
 
+def test_one_that_goes_on_is_interrupted_where_it_was_until_it_is_there(tmp_path: Path) -> None:
+    found = Interrupted("part.gcode", 1000, 77, 9, {"z": None, "heaters": {"extruder": 210.0}, "line": 9})
+    journal = Journal(tmp_path / NAME, pytest.fail)
+    journal.go_on(found)
+    journal.close(None)
+    assert read_journal(tmp_path / NAME) == found
+    journal = Journal(tmp_path / NAME, pytest.fail)
+    journal.go_on(found)
+    journal.note(10, {})
+    journal.close(None)
+    assert read_journal(tmp_path / NAME) == Interrupted("part.gcode", 1000, 77, 10, {"line": 10})
+
+
 def test_wherever_it_is_cut_off_it_tells_an_earlier_line_or_none(tmp_path: Path) -> None:
     path = written(tmp_path, (5, {"x": "é"}), (9, {}), (13, {}), ended=True)
     data = path.read_bytes()
@@ -57,7 +70,8 @@ def test_wherever_it_is_cut_off_it_tells_an_earlier_line_or_none(tmp_path: Path)
     "text", ["", "nonsense", "[1]\n{}", '{"journal":2,"file":"a","size":1,"modified_ns":1}\n{"line":3}',
              '{"journal":1,"file":"a"}\n{"line":3}', '{"line":3}',
              '{"journal":1,"file":"a","size":"x","modified_ns":1}\n{"line":3}',
-             '{"journal":1,"file":"a","size":1,"modified_ns":1}\n{"line":"x"}', "[" * 100_000,
+             '{"journal":1,"file":"a","size":1,"modified_ns":1}\n{"line":"x"}',
+             '{"journal":1,"file":"a","size":1,"modified_ns":1,"goes_on":3}', "[" * 100_000,
              *(f'{{"journal":1,"file":"a","size":{size},"modified_ns":1}}\n{{"line":3}}'
                for size in ("Infinity", "NaN", "true", "1.5", "-1", "1" * 30)),
              '{"journal":1,"file":["a"],"size":1,"modified_ns":1}\n{"line":3}',
