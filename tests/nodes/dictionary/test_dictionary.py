@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nodes.dictionary.dictionary import BOOTSTRAP, MAX_INFLATED_BYTES, Dictionary
+from nodes.dictionary.dictionary import BOOTSTRAP, MAX_INFLATED_BYTES, Dictionary, _unique
 from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value
 from nodes.dictionary.parts import OUTPUT, DictionaryError
 from tests import real_dictionaries
@@ -274,6 +274,27 @@ def test_hostile_parts_are_refused_in_a_sentence(parts: dict[str, Any], sentence
 def test_hostile_json_is_refused_in_a_sentence(text: bytes, sentence: str) -> None:
     with pytest.raises(DictionaryError, match=sentence):
         Dictionary.from_json(text)
+
+
+class ComparedName(str):
+    """A name that counts how often names are compared."""
+
+    __slots__ = ()
+    compared = 0
+
+    def __eq__(self, other: object) -> bool:
+        ComparedName.compared += 1
+        return str.__eq__(self, other)
+
+    __hash__ = str.__hash__
+
+
+def test_a_name_that_stands_twice_is_found_in_one_pass() -> None:
+    """By the square of their number, the names that a node can send took the loop minutes."""
+    names = [ComparedName(f"n{i}") for i in range(1000)] + [ComparedName("n999")]
+    with pytest.raises(ValueError, match="'n999' stands twice in one object"):
+        _unique([(name, 1) for name in names])
+    assert ComparedName.compared <= len(names)
 
 
 @pytest.mark.parametrize(
