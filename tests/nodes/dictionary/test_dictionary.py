@@ -268,6 +268,7 @@ def test_hostile_parts_are_refused_in_a_sentence(parts: dict[str, Any], sentence
         (b'{"config": {"A": ' + b"9" * 5000 + b"}}", "not usable JSON"),
         (b'{"config": {"ADC_MAX": ' + b"9" * 400 + b"}}", "has more than 64 bits"),
         (b'{"config": {"A": -1e999}}', "is too large"),
+        (b'{"output": {"x\\ud800 %u": 7}}', "a text in it has half of a surrogate pair"),
         (b" " * (MAX_INFLATED_BYTES + 1), "more than 1048576 bytes"),
     ],
 )
