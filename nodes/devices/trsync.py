@@ -8,7 +8,9 @@ from typing import Final
 from nodes.devices.device import Device
 from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
+from nodes.node.errors import NodeError
 from nodes.node.node import Node
+from nodes.node.request_reply import QUERY_TRIES
 
 COMMANDS: Final = ("config_trsync", "trsync_start", "trsync_set_timeout", "trsync_trigger")
 GROUPS_CONSTANT: Final = "CAN_TRIGGER_GROUPS"
@@ -93,14 +95,21 @@ class Trsync(Device):
         node.link.send_urgent(content)
 
     async def finish(self, node: Node) -> TrsyncState:
-        """End the homing move and return how it ended; trigger it unless it has triggered."""
-        while True:
+        """End the homing move and return how it ended; trigger it unless it has triggered.
+
+        Raises NodeError when NODE does not say that it has, and as ``Node.query`` does.
+        """
+        for _ in range(QUERY_TRIES):
             answer = await node.query(
                 "trsync_trigger", "trsync_state", oid=self._oid, reason=int(TriggerReason.HOST)
             )
             # An earlier report, delayed by a repeated block, looks like the answer.
             if not (state := _state(answer)).armed:
                 return state
+        raise NodeError(
+            f"{self.description} has not triggered, though node {node.name} was told to {QUERY_TRIES} times;"
+            " restart the machine, and flash the node's firmware again if this comes again"
+        )
 
     def listen(self, node: Node, on_state: Callable[[TrsyncState], None]) -> Callable[[], None]:
         """Call ON_STATE for every report; return a function that ends it."""

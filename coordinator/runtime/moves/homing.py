@@ -13,7 +13,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from coordinator.config.model import CanConnection, RailDescription, StepperDescription
@@ -128,6 +128,8 @@ class _Leg:
     triggered: asyncio.Event
     triggered_s: float | None = None
     """Print time at which the host heard of it."""
+    unknown: dict[str, CanductorError] = field(default_factory=dict)
+    """By node: why it is not known how its round ended."""
 
     @property
     def name(self) -> str:
@@ -307,9 +309,7 @@ class HomingMove:
             leg.triggered_s = move.print_time_now()
             leg.triggered.set()
             self._changed.set()
-            for other, other_sync in leg.syncs:
-                if other.talks:
-                    other_sync.trigger_now(other)
+            _trigger(leg)
 
         return heard
 
@@ -338,20 +338,20 @@ class HomingMove:
     async def _end(leg: _Leg) -> dict[str, TrsyncState]:
         """Stop what is not stopped yet, drop what is queued; return how every node's round ended."""
         states = {}
+        _trigger(leg)
         for node, sync in leg.syncs:
-            if node.talks:
-                sync.trigger_now(node)
-        for node, sync in leg.syncs:
-            with contextlib.suppress(CanductorError):  # whoever is missing afterwards was lost
+            try:
                 states[node.name] = await sync.finish(node)
-        if leg.endstop_node.talks:
+            except CanductorError as error:
+                leg.unknown[node.name] = error
+        with contextlib.suppress(CanductorError):
             leg.endstop.end(leg.endstop_node)
         return states
 
     def _check(self, leg: _Leg, states: dict[str, TrsyncState]) -> None:
         for node, _ in leg.syncs:
             if node.name not in states:
-                raise node.failure or HomingError(f"node {node.name} did not answer while an axis homed")
+                raise node.failure or MoveEndedError(leg.name, str(leg.unknown[node.name]))
             if states[node.name].reason is TriggerReason.TIMEOUT:
                 raise MoveEndedError(
                     leg.name,
@@ -422,6 +422,13 @@ def _not_found_cure(rail: RailDescription) -> str:
 def _way(leg: _Leg, move: SingleMove, steps: dict[str, int]) -> float:
     """Return how far a rail has gone, mm, by the STEPS of its steppers."""
     return sum(steps[s.name] * s.step_distance / move.along(s) for s in leg.steppers) / len(leg.steppers)
+
+
+def _trigger(leg: _Leg) -> None:
+    """Stop all nodes of LEG; one that is lost, which its own time-out stops, keeps no other from it."""
+    for node, sync in leg.syncs:
+        with contextlib.suppress(CanductorError):
+            sync.trigger_now(node)
 
 
 def _switched(leg: _Leg, states: Mapping[str, TrsyncState]) -> bool:

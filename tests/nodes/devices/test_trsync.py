@@ -1,0 +1,53 @@
+"""Stop groups whose node does not say what it should."""
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from nodes.devices.trsync import TriggerReason, Trsync
+from nodes.dictionary.message_format import Message
+from nodes.node.errors import NodeError
+from nodes.node.request_reply import QUERY_TRIES
+
+ENDLESS = 1000
+
+
+def node_that_is_armed_for(reports: int) -> Any:
+    """Return a node that says so often that its group has not triggered; ``asked`` counts."""
+    node = SimpleNamespace(name="mcu", asked=0)
+
+    async def query(*_: object, **__: object) -> Message:
+        node.asked += 1
+        assert node.asked < ENDLESS
+        armed = node.asked <= reports
+        return Message(
+            "trsync_state",
+            {"oid": 3, "can_trigger": int(armed), "trigger_reason": 0 if armed else 2, "clock": 7},
+        )
+
+    node.query = query
+    return node
+
+
+def group() -> Trsync:
+    found = Trsync("homing on node mcu")
+    found.oid = 3
+    return found
+
+
+def test_reports_from_before_the_trigger_are_passed_over() -> None:
+    node = node_that_is_armed_for(QUERY_TRIES - 1)
+    state = asyncio.run(group().finish(node))
+    assert (state.armed, state.reason, node.asked) == (False, TriggerReason.HOST, QUERY_TRIES)
+
+
+def test_a_node_that_never_triggers_is_not_asked_for_ever() -> None:
+    """Failed before: the homing that waited for it never ended."""
+    node = node_that_is_armed_for(ENDLESS)
+    with pytest.raises(
+        NodeError, match="for homing on node mcu has not triggered, though node mcu was told to 12 times; "
+    ):
+        asyncio.run(group().finish(node))
+    assert node.asked == QUERY_TRIES
