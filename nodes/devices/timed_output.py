@@ -74,7 +74,8 @@ class TimedOutput(Device):
 
         Raises NodeError when the node cannot accept it.
         """
-        oid = self._oid  # raises before anything waits for a slot
+        oid = self._oid
+        node.check_ready()  # before anything waits for a slot: it may have none
         self._last_clock = clock = max(clock, self._last_clock)
         if not self._waiting and self._has_slot(node):
             self._send(node, oid, clock, value)

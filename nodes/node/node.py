@@ -260,6 +260,12 @@ class Node:
             return False
         return bool(answer.message.integer("is_config"))
 
+    def check_ready(self) -> None:
+        """Raise NodeError unless the node is configured and works."""
+        self._check_usable()
+        if self.state is not NodeState.READY:
+            raise NodeError(f"node {self.name} is {self.state.value} and not ready yet")
+
     def _check_usable(self) -> None:
         if self.failure is not None:
             raise self.failure.with_traceback(None)

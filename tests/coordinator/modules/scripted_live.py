@@ -30,6 +30,9 @@ class Board:
         self.sent: list[tuple[float, float]] = []
         self.broken: str | None = None
 
+    def check_ready(self) -> None:
+        assert self.state is NodeState.READY
+
     def send(self, command: str, *, req_clock: int, oid: int, clock: int, on_ticks: int) -> None:
         assert (command, oid >= 0, clock) == ("queue_digital_out", True, req_clock)
         if self.broken is not None:

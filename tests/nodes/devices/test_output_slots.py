@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
 from nodes.devices.timed_output import TRANSIT_S
+from nodes.node.errors import NodeError, NodeLost
 from nodes.node.queue_slots import OUTPUT_SLOTS_MAX, OUTPUT_SLOTS_MIN, STEP_SLOTS_MIN, share_slots
+from nodes.node.states import NodeState
 from tests.nodes.devices.machine import HZ, DeviceMachine
 
 SLOTS = 16
@@ -98,5 +100,30 @@ def test_values_that_wait_are_forgotten_with_the_life_of_their_node() -> None:
         out.set(machine.node, machine.clock(0.3), on=True)
         await asyncio.sleep(0.5)
         assert machine.board.level(machine.pins["PA3"]) == 1
+
+    machine.run(main)
+
+
+@pytest.mark.parametrize(
+    ("state", "failure", "sentence"),
+    [
+        (NodeState.CONFIGURING, None, "node n1 is being configured and not ready yet"),
+        (NodeState.LOST, NodeLost("lost node n1: no answer"), "lost node n1: no answer"),
+    ],
+)
+def test_nothing_waits_for_the_slots_of_a_node_that_has_none(
+    state: NodeState, failure: NodeLost | None, sentence: str
+) -> None:
+    """As while it is configured, and when that failed. Failed before: IndexError, and each value waited."""
+    out = DigitalOut("lamp", pin="PA3")
+    machine = DeviceMachine(out)
+
+    async def main() -> None:
+        node = machine.node
+        node.output_slots, node.state, node.failure = 0, state, failure
+        for _ in range(3):
+            with pytest.raises(NodeError, match=sentence):
+                out.set(node, machine.clock(0.5), on=True)
+        assert not out._waiting
 
     machine.run(main)
