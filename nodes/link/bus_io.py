@@ -23,8 +23,8 @@ from nodes.link.types import (
 )
 from nodes.support.c_structs import from_struct
 
-_BATCH = 512
-"""Events taken from the thread in one call."""
+_BATCH = 128
+"""Most events taken from the bus and handled in one turn of the loop, some ms: normal traffic is a dozen."""
 
 
 class LinkIO:
@@ -74,6 +74,8 @@ class LinkIO:
         self._lib, self._ffi = driver.lib, driver.ffi
         self._final = self._ffi.new("struct io_stats *")
         self._events = self._ffi.new("struct io_event[]", _BATCH)
+        self._goes_on = False
+        """Whether the next turn of the loop takes what is left."""
         driver.listen(self._handle_events)
 
     @property
@@ -117,7 +119,7 @@ class LinkIO:
             on_responses=on_responses,
             on_lost=on_lost,
             on_close=self._links.pop,
-            take=self._handle_events,
+            take=self._take,
         )
         self._links[number[0]] = link
         return link
@@ -182,13 +184,26 @@ class LinkIO:
         self._bus.close()
 
     def _handle_events(self) -> None:
-        # A callback may close this bus or any link: every step checks again.
-        taken = _BATCH
-        while taken == _BATCH and self._bus.open:
-            taken = self._lib.io_take(self._bus.live(), self._events, _BATCH)
-            self._hand_over(taken)
+        """Take what has arrived. A flood has one batch of each turn of the loop, others have the rest."""
+        if not self._goes_on:
+            self._take()
+
+    def _go_on(self) -> None:
+        self._goes_on = False
+        self._take()
+
+    def _take(self) -> None:
+        """Hand over one batch of what has arrived; what is left follows in the next turn of the loop."""
+        if not self._bus.open:
+            return
+        taken = self._lib.io_take(self._bus.live(), self._events, _BATCH)
+        if taken == _BATCH and not self._goes_on:
+            self._goes_on = True
+            asyncio.get_running_loop().call_soon(self._go_on)
+        self._hand_over(taken)
 
     def _hand_over(self, taken: int) -> None:
+        # A callback may close this bus or any link: every step checks again.
         responses: dict[int, list[Response]] = {}
         frames: list[Frame] = []
         notices: list[tuple[int, int, int]] = []

@@ -32,7 +32,7 @@ class Link:
     ) -> None:
         self._on_close = on_close
         self.take = take
-        """Hands over at once what has arrived on the bus, so that nothing of it waits."""
+        """Hands over at once what has arrived on the bus, as much as in a turn of the loop."""
         self._bus = bus
         self._lib, self._ffi = bus.lib, bus.ffi
         self._number = number

@@ -133,8 +133,9 @@ struct io_stats {
     uint64_t at_ns;                       // time of these counters
 };
 
-// Moves up to ROOM events to OUT, notices after the responses received before them; returns their number.
-// Fewer than ROOM: the driver notifies when there are more.
+// Moves up to ROOM events to OUT, frames first, notices after the responses received before them; returns
+// their number. Fewer than ROOM: the driver notifies when there are more. What fills half of its ring, a
+// flood, gets half of ROOM while anything else waits.
 size_t io_take(struct io_bus *bus, struct io_event *out, size_t room);
 
 // Returns whether io_take() has something that may wait, so that the driver has not notified yet. Takes no

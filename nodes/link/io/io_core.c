@@ -190,6 +190,11 @@ static size_t take_ring(struct io_ring *ring, struct io_event *out, size_t room)
     return taken;
 }
 
+// Returns how much of ROOM is for RING: half in a flood, whose end what comes behind it does not wait for.
+static size_t share(const struct io_ring *ring, size_t room) {
+    return ring->count > ring->size / 2 ? room / 2 : room;
+}
+
 // Moves a pending notice to OUT, if there is room; returns the number of events.
 static size_t take_notice(uint8_t *pending, struct io_event *out, size_t room, struct io_event event) {
     if (!*pending || room == 0)
@@ -216,9 +221,11 @@ static size_t take_notices(struct io_bus *bus, struct io_event *out, size_t room
 
 size_t io_take(struct io_bus *bus, struct io_event *out, size_t room) {
     io_lock(bus);
-    size_t taken = take_ring(&bus->responses, out, room);
-    taken += take_ring(&bus->unclaimed, out + taken, room - taken);
+    size_t taken = take_ring(&bus->unclaimed, out, share(&bus->unclaimed, room));
+    taken += take_ring(&bus->responses, out + taken, share(&bus->responses, room - taken));
     taken += take_notices(bus, out + taken, room - taken);
+    taken += take_ring(&bus->unclaimed, out + taken, room - taken);
+    taken += take_ring(&bus->responses, out + taken, room - taken);
     io_publish(bus);
     if (taken < room) { // also without a notice: that of what is taken already may come late
         bus->noticed = 0;

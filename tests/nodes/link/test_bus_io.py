@@ -24,6 +24,11 @@ from tests.wire_twin import block
 
 RESPONSE_ID = 0x101 + 2 * 4
 """From node 4."""
+BATCH = 128
+"""Events that are handled in one turn of the loop."""
+MANY = 3000
+"""Responses that wait: more than half of their ring."""
+ENDLESS = 100
 
 
 class Bus:
@@ -150,31 +155,76 @@ def test_a_bit_rate_is_learned_once() -> None:
 # --------------------------------------------------------------------------------------------- handing over
 
 
-def test_everything_is_handed_over_in_one_go_though_it_is_taken_in_parts() -> None:
-    bus = Bus()
-    bus.inbox = inbox = Inbox()
-    bus.io = LinkIO.driven_by(bus.driver, on_frame=inbox.on_frame, on_closed=inbox.on_closed)
-    bus.open(LinkSettings(4))
-    bus.responses_come(700)
-    bus.frames_come(600)
-    lib.io_end(bus.driver.bus, 0)
-    bus.driver.hand_over()
-    assert [response.content[0] for response in inbox.responses] == [i % 251 for i in range(700)]
-    assert [int.from_bytes(frame.data) for frame in inbox.frames] == list(range(600))
-    assert {(f.can_id, f.received_ns) for f in inbox.frames} == {(0x3F1, START_NS)}
-    assert len(inbox.closed) == 1
+def test_what_comes_at_once_is_handed_over_in_turns_of_the_loop() -> None:
+    async def test() -> None:
+        bus = Bus()
+        bus.inbox = inbox = Inbox()
+        bus.io = LinkIO.driven_by(bus.driver, on_frame=inbox.on_frame, on_closed=inbox.on_closed)
+        bus.open(LinkSettings(4))
+        bus.responses_come(700)
+        bus.frames_come(600)
+        lib.io_end(bus.driver.bus, 0)
+        bus.driver.hand_over()
+        turns, before = 1, 0
+        while now := len(inbox.responses) + len(inbox.frames) - before:
+            assert now <= BATCH
+            before += now
+            turns += 1
+            await asyncio.sleep(0)
+        assert turns - 1 == -(-1301 // BATCH)
+        assert [response.content[0] for response in inbox.responses] == [i % 251 for i in range(700)]
+        assert [int.from_bytes(frame.data) for frame in inbox.frames] == list(range(600))
+        assert {(f.can_id, f.received_ns) for f in inbox.frames} == {(0x3F1, START_NS)}
+        assert len(inbox.closed) == 1
+
+    asyncio.run(test())
 
 
-@pytest.mark.parametrize(("count", "order"), [(511, "frame first"), (512, "responses first")])
-def test_frames_go_before_the_responses_that_are_taken_with_them(count: int, order: str) -> None:
-    seen: list[str] = []
-    bus = Bus(on_frame=lambda _: seen.append("frame first"))
-    bus.open(LinkSettings(4), on_responses=lambda _: seen.append("responses first"))
-    bus.responses_come(count)
-    bus.frames_come(1)
-    bus.driver.hand_over()
-    assert len(seen) == 2
-    assert seen[0] == order
+def test_a_flood_holds_the_loop_for_a_batch_in_each_turn() -> None:
+    """Failed before: what came while a batch was handled was handled at once, too, without end."""
+
+    async def test() -> None:
+        seen: list[int] = []
+        ended: list[str] = []
+
+        def flood(responses: list[Response]) -> None:
+            seen.append(len(responses))
+            assert len(seen) < ENDLESS
+            bus.responses_come(len(responses))
+
+        bus = Bus(on_closed=ended.append)
+        link = bus.open(LinkSettings(4), on_responses=flood)
+        bus.responses_come(MANY)
+        bus.driver.hand_over()
+        for turn in range(1, 4):
+            bus.driver.hand_over()  # the descriptor is readable again in each turn
+            assert seen == [BATCH] * turn
+            await asyncio.sleep(0)
+        link.take()
+        assert len(seen) == 5, "who asks gets a batch at once"
+        lib.io_end(bus.driver.bus, 0)
+        await asyncio.sleep(0)
+        assert len(ended) == 1, "and a notice does not wait for the end of the flood"
+        bus.io.close()
+        await asyncio.sleep(0)
+        assert len(seen) == 6
+
+    asyncio.run(test())
+
+
+def test_frames_go_before_all_responses() -> None:
+    """The frame with which a node stops its bus has the reason."""
+
+    async def test() -> None:
+        seen: list[str] = []
+        bus = Bus(on_frame=lambda _: seen.append("frame"))
+        bus.open(LinkSettings(4), on_responses=lambda _: seen.append("responses"))
+        bus.responses_come(2 * BATCH)
+        bus.frames_come(1)
+        bus.driver.hand_over()
+        assert seen == ["frame", "responses"]
+
+    asyncio.run(test())
 
 
 def test_nobody_has_to_listen() -> None:
@@ -191,10 +241,14 @@ def test_a_bus_that_a_handler_closes_hands_nothing_more_over() -> None:
         inbox.on_frame(frame)
         bus.io.close()
 
+    async def close_amid_frames() -> None:
+        bus.frames_come(600)
+        bus.driver.hand_over()
+        await asyncio.sleep(0)
+        assert len(inbox.frames) == 1
+
     bus = Bus(on_frame=close)
-    bus.frames_come(600)
-    bus.driver.hand_over()
-    assert len(inbox.frames) == 1
+    asyncio.run(close_amid_frames())
 
     bus = Bus(on_closed=inbox.on_closed)
     bus.open(LinkSettings(4), on_responses=lambda _: bus.io.close())

@@ -61,6 +61,12 @@ static void number_comes(struct scene *scene, unsigned number) {
     frame_comes(scene, OTHER_ID, data, sizeof data);
 }
 
+static void response_comes(struct scene *scene, uint8_t value) {
+    uint8_t block[WIRE_BLOCK_MAX] = {[WIRE_HEADER] = value};
+    CHECK_EQUAL(wire_block_finish(block, 1, 0), 6);
+    frame_comes(scene, 0x101 + 2 * FIRST_NODE, block, 6);
+}
+
 static void send_all(struct scene *scene) {
     uint8_t out[IO_OUT_FRAMES * FRAME];
     while (io_next(scene->bus, scene->now_ns, 0, out, sizeof out) > 0)
@@ -81,9 +87,7 @@ static void let_everything_happen(struct scene *scene) {
     for (unsigned i = 0; i < NODES; i++)
         send_control(scene, i);
     for (uint8_t value = 1; value <= 2; value++) {
-        uint8_t block[WIRE_BLOCK_MAX] = {[WIRE_HEADER] = value};
-        CHECK_EQUAL(wire_block_finish(block, 1, 0), 6);
-        frame_comes(scene, 0x101 + 2 * FIRST_NODE, block, 6);
+        response_comes(scene, value);
         number_comes(scene, value);
     }
     while (scene->now_ns < 2500 * MS) {
@@ -100,10 +104,10 @@ static void check_event(const struct scene *scene, const struct io_event *event,
         int link; // of links; -1: none
         int value;
     } wanted[] = {
-        {IO_RESPONSE, 0, 1},
-        {IO_RESPONSE, 0, 2},
         {IO_FRAME, -1, 1},
         {IO_FRAME, -1, 2},
+        {IO_RESPONSE, 0, 1},
+        {IO_RESPONSE, 0, 2},
         {IO_DRAINED, 0, 0},
         {IO_LOST, 0, LINK_CAUSE_SILENT},
         {IO_DRAINED, 1, 0},
@@ -222,6 +226,37 @@ static void a_full_ring_drops_what_is_oldest(void) {
     io_free(scene.bus);
 }
 
+// With room for eight, what is taken is of the kinds WANTED, and there is more.
+static void check_kinds(struct scene *scene, const enum io_notice *wanted) {
+    struct io_event events[8];
+    CHECK_EQUAL(io_take(scene->bus, events, 8), 8);
+    for (unsigned i = 0; i < 8; i++)
+        CHECK_EQUAL(events[i].notice, wanted[i]);
+    CHECK_EQUAL(scene->quiet, 0);
+}
+
+static void a_flood_lets_everything_else_through(void) {
+    static const enum io_notice of_responses[] = {IO_FRAME, IO_RESPONSE, IO_RESPONSE, IO_RESPONSE,
+                                                  IO_ENDED, IO_RESPONSE, IO_RESPONSE, IO_RESPONSE};
+    static const enum io_notice of_frames[] = {IO_FRAME,    IO_FRAME, IO_FRAME, IO_FRAME,
+                                               IO_RESPONSE, IO_ENDED, IO_FRAME, IO_FRAME};
+    struct scene scene;
+    begin(&scene);
+    for (unsigned i = 0; i <= IO_RESPONSES_MAX / 2; i++)
+        response_comes(&scene, 1);
+    number_comes(&scene, 1);
+    io_end(scene.bus, ENETDOWN);
+    check_kinds(&scene, of_responses);
+    io_free(scene.bus);
+    begin(&scene);
+    for (unsigned i = 0; i <= IO_FRAMES_MAX / 2; i++)
+        number_comes(&scene, i);
+    response_comes(&scene, 1);
+    io_end(scene.bus, ENETDOWN);
+    check_kinds(&scene, of_frames);
+    io_free(scene.bus);
+}
+
 // However much comes in all, a ring that is emptied touches no more of its memory than waited at once.
 static void a_ring_that_is_emptied_begins_again(void) {
     struct scene scene;
@@ -301,6 +336,7 @@ int main(void) {
     a_silent_node_is_told_of_again_and_again_until_it_is_lost();
     a_ring_that_is_emptied_begins_again();
     a_full_ring_drops_what_is_oldest();
+    a_flood_lets_everything_else_through();
     counters_keep_up_with_what_is_taken();
     time_acts_on_every_link();
     what_was_held_back_is_due_once();
