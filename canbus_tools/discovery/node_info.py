@@ -10,7 +10,6 @@ from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message
 from nodes.dictionary.parts import DictionaryError
 from nodes.support.can_protocol import UUID_SIZE
-from nodes.support.errors import CanductorError
 
 BUS_STATES: Final = "canbus_bus_state"
 _TICKS_PER_WORD: Final = 1 << 32
@@ -120,10 +119,9 @@ def _text(dictionary: Dictionary, constant: str) -> str:
 
 def _number(dictionary: Dictionary, constant: str) -> int | None:
     try:
-        value = dictionary.int_constant(constant)
-    except CanductorError:
+        return dictionary.int_constant(constant)
+    except DictionaryError:
         return None
-    return value if value > 0 else None
 
 
 def _integer(message: Message | None, param: str) -> int | None:

@@ -165,6 +165,8 @@ def _read_dictionary(path: Path) -> Dictionary:
     except OSError as error:
         raise CanductorError(f"cannot read the dictionary {path}: {error.strerror}; check the path") from None
     try:
-        return Dictionary.from_json(text)
+        dictionary = Dictionary.from_json(text)
+        dictionary.check_constants()
     except CanductorError as error:
         raise CanductorError(f"{path}: {error}") from None
+    return dictionary

@@ -104,7 +104,8 @@ class CanBus(BusBase):
 
     def emergency_stop(self) -> None:
         """Stop every node that can be reached: by frames that our firmware obeys at once, and one by one."""
-        if any(node.dictionary.int_constant(KNOWS_BUS_STOP, 0) for node in self.nodes):
+        # No look-up that may raise: what one node says keeps the stop from no other.
+        if any(node.dictionary.constants.get(KNOWS_BUS_STOP) for node in self.nodes):
             with contextlib.suppress(CanductorError):  # the bus may be what failed
                 for _ in range(BUS_STOP_FRAMES):
                     self.io.send_frame(BUS_STOP_ID, bytes(BUS_STOP.size))
@@ -320,7 +321,7 @@ class _CanConnector:
 
 
 def _knows_pulses(node: Node) -> bool:
-    return node.talks and bool(node.dictionary.int_constant(CONSTANT, 0))
+    return node.talks and bool(node.dictionary.constants.get(CONSTANT))
 
 
 def _twins(uuid: Uuid, bus: str) -> str:

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Mapping
 from typing import Final, TypeVar
 
+from nodes.dictionary.constants import CONSTANTS
 from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value, vlq_read
 from nodes.dictionary.parts import (
     DictionaryError,
@@ -96,12 +97,27 @@ class Dictionary:
         raise MessageError(f"the node's firmware ({self.version}) has no command {name!r}")
 
     def int_constant(self, name: str, default: int | None = None) -> int:
-        """Return an integer constant, or DEFAULT; DictionaryError when there is neither."""
-        value = self.constants.get(name, default)
-        if isinstance(value, int):
+        """Return an integer constant of CONSTANTS, or DEFAULT where the dictionary has none.
+
+        DictionaryError when there is neither, or it is out of its range.
+        """
+        value = self.constants.get(name)
+        if value is None and default is not None:
+            return default
+        low, high = CONSTANTS[name]
+        if isinstance(value, int) and low <= value <= high:
             return value
-        found = "missing" if value is None else f"{value!r}"
-        raise DictionaryError(f"dictionary: constant {name} must be a whole number and is {found}")
+        found = "missing" if value is None else f"{value!r:.60}"
+        raise DictionaryError(
+            f"dictionary: constant {name} must be a whole number of {low}..{high} and is {found}; "
+            "flash the firmware again, or report this to its makers"
+        )
+
+    def check_constants(self) -> None:
+        """Raise DictionaryError for a constant of CONSTANTS that is out of its range, or no CLOCK_FREQ."""
+        for name in CONSTANTS:
+            if name in self.constants or name == "CLOCK_FREQ":
+                self.int_constant(name)
 
     def str_constant(self, name: str, default: str | None = None) -> str:
         """Return a text constant, or DEFAULT; DictionaryError when there is neither."""
@@ -114,18 +130,12 @@ class Dictionary:
     @property
     def clock_freq_hz(self) -> int:
         """Nominal ticks per second, > 0."""
-        freq_hz = self.int_constant("CLOCK_FREQ")
-        if 0 < freq_hz < 1 << 32:
-            return freq_hz
-        raise DictionaryError(f"dictionary: CLOCK_FREQ={freq_hz} is not a frequency")
+        return self.int_constant("CLOCK_FREQ")
 
     @property
     def receive_window(self) -> int:
         """Bytes that may be in flight to the node (192 unless the dictionary says so)."""
-        window = self.int_constant("RECEIVE_WINDOW", 192)
-        if 64 <= window < 1 << 20:
-            return window
-        raise DictionaryError(f"dictionary: RECEIVE_WINDOW={window} cannot hold a block of 64 bytes")
+        return self.int_constant("RECEIVE_WINDOW", 192)
 
     def enumeration_for(self, param: str) -> Enumeration | None:
         """Return the enumeration of parameter PARAM: named like it or like the part after an underscore."""

@@ -1,6 +1,7 @@
 """The messages that the coordinator needs of any firmware, checked once when its dictionary is read.
 
-Afterwards these messages can be used without a check; an unsuitable dictionary raises one sentence here.
+Afterwards these messages, and the constants, can be used without a check; an unsuitable dictionary raises one
+sentence here.
 """
 
 from typing import Final
@@ -27,11 +28,12 @@ OPTIONAL_RESPONSES: Final = {
     "shutdown": ("clock", "static_string_id"),
     "is_shutdown": ("static_string_id",),
     "stepper_position": ("oid", "pos"),
+    "sync_pulse": ("seq", "clock"),
 }
 
 
 def check_vocabulary(dictionary: Dictionary) -> None:
-    """Raise DictionaryError when a firmware cannot be used because it lacks messages."""
+    """Raise DictionaryError when a firmware cannot be used: it lacks messages, or a constant is no use."""
     for name, params in REQUIRED_COMMANDS.items():
         found = dictionary.commands.get(name)
         if found is None or found.names != params:
@@ -40,7 +42,7 @@ def check_vocabulary(dictionary: Dictionary) -> None:
     for name, params in (REQUIRED_RESPONSES | optional).items():
         if name not in dictionary.responses or not _carries(dictionary, name, params):
             raise _unusable(dictionary, "response", name, params)
-    _ = dictionary.clock_freq_hz, dictionary.receive_window, dictionary.int_constant("STATS_SUMSQ_BASE", 256)
+    dictionary.check_constants()
 
 
 def carries_identity(dictionary: Dictionary) -> bool:

@@ -18,7 +18,7 @@ from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
 from nodes.link import BusLoad, Forecast, Frame, IOStats, LinkError, LinkSettings, Response
 from nodes.link.interfaces import OnFrame, OnLost, OnResponses
-from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, BUS_STOP_ID
 
 DATA = Path(__file__).parents[1] / "data" / "dictionary.json"
 DELAY_S = 0.0003
@@ -281,6 +281,8 @@ class TwinIO:
         self.on_frame: OnFrame | None = None
         self.on_closed: OnLost | None = None
         self.closed = False
+        self.frames: list[tuple[int, bytes]] = []
+        """Those of no link."""
 
     def __call__(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> "TwinIO":
         self.on_frame, self.on_closed, self.closed = on_frame, on_closed, False
@@ -312,8 +314,9 @@ class TwinIO:
         raise AssertionError("a twin bus measures nothing")
 
     def send_frame(self, can_id: int, data: bytes) -> None:
-        assert can_id == ADMIN_ID
-        for node in self.nodes:
+        assert can_id in (ADMIN_ID, BUS_STOP_ID)
+        self.frames.append((can_id, data))
+        for node in self.nodes if can_id == ADMIN_ID else ():
             answer = node.admin(data) if self.source.random() >= self.loss else None
             if answer is not None and self.source.random() >= self.loss:
                 frame = Frame(ADMIN_RESPONSE_ID, answer, 0)

@@ -14,15 +14,22 @@ from coordinator.planning.report import PlanReport
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.node.config import NodeConfigError
+from nodes.support.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, firmware_path
 
 MACHINE = (Path(__file__).parents[3] / "config" / "cartesian_uart.cfg").read_text(encoding="utf-8")
 
 
-def planned(folder: Path, config: str, cache: DictionaryCache | None = None) -> PlanReport:
+def planned(
+    folder: Path,
+    config: str,
+    cache: DictionaryCache | None = None,
+    dictionaries: dict[str, Path] | None = None,
+) -> PlanReport:
     (folder / "printer.cfg").write_text(config, encoding="utf-8")
     (folder / "move.gcode").write_text("G28\nG1 X10 F6000\n", encoding="utf-8")
-    options = PlanOptions(config=folder / "printer.cfg", gcode=folder / "move.gcode")
+    machine, program = folder / "printer.cfg", folder / "move.gcode"
+    options = PlanOptions(config=machine, gcode=program, dictionaries=dictionaries or {})
     return plan_file(options, cache=cache or DictionaryCache(folder / "cache"))
 
 
@@ -102,6 +109,15 @@ def test_a_node_that_was_connected_once_has_the_pins_of_its_dictionary(tmp_path:
     assert not any(text.startswith("node mcu:") for text in report.notices)
     with pytest.raises(ConfigError, match="has no pin 'PH3'"):
         planned(tmp_path, with_step_pin("PH3"), again)
+
+
+def test_a_dictionary_with_a_constant_that_cannot_be_is_refused_by_its_file(tmp_path: Path) -> None:
+    content = json.loads(firmware_path(MAINBOARD).with_suffix(".json").read_bytes())
+    content["config"]["ADC_MAX"] = 0
+    file = tmp_path / "odd.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(CanductorError, match=r"odd\.json: dictionary: constant ADC_MAX must be .* and is 0;"):
+        planned(tmp_path, MACHINE, dictionaries={"mcu": file})
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"{broken", b'{"serial /dev/ttyS0": "0"}'])
