@@ -132,6 +132,7 @@ class LinkIO:
     def send_frame(self, can_id: int, data: bytes) -> None:
         """Send one CAN frame that belongs to no link, before all data; from any thread.
 
+        A stop (an id below those of data) goes at once, whatever the bus is taken to carry.
         Raises LinkError when that fails.
         """
         content = self._ffi.from_buffer(data)

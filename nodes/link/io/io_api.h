@@ -182,7 +182,9 @@ void io_set_bitrate(struct io_bus *bus, uint32_t bitrate);
 // Requests one IO_DRAINED when nothing is pending (possibly at once).
 enum io_status io_watch_drained(struct io_bus *bus, uint32_t number);
 
-// Queues one frame ahead of all data. IO_FULL, IO_INVALID (longer than 8 bytes, or a serial line), IO_CLOSED.
+// Queues one frame ahead of all data, and one with an id below those of data (a stop) ahead of all frames and
+// without regard to what waits in the kernel. IO_FULL, IO_INVALID (longer than 8 bytes, or a serial line),
+// IO_CLOSED.
 enum io_status io_send_frame(struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size);
 
 // Traffic of a link: sent of one class, or received. A frame that two blocks share counts for the later one.

@@ -96,7 +96,7 @@ struct io_bus {
     struct io_link *links[IO_LINKS_MAX];
     struct io_link *by_nodeid[256];
     struct io_ring responses, unclaimed;
-    struct can_frame admin[IO_ADMIN_MAX]; // to be sent
+    struct can_frame admin[IO_ADMIN_MAX]; // to be sent, stops first
     size_t admin_first, admin_count;
     uint8_t rest[IO_FRAME_SIZE]; // IO_CAN_STREAM: bytes of a received frame that is not complete
     size_t rest_size;
@@ -124,6 +124,11 @@ void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, s
 struct io_link *io_next_link(const struct io_bus *bus, uint64_t now, unsigned allowed,
                              const struct io_link *ending, struct link_offer *best);
 void io_served(struct io_bus *bus, const struct io_link *node);
+
+// Returns whether a frame of no link stops what nodes do: its id comes before those of all data.
+static inline int io_is_stop(uint32_t can_id) {
+    return can_id < IO_DATA_ID;
+}
 
 // Bits of a frame for the budget; 0 while the bit rate is unknown.
 uint32_t io_frame_bits(const struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size);

@@ -213,7 +213,12 @@ enum io_status io_send_frame(struct io_bus *bus, uint32_t can_id, const uint8_t 
     io_lock(bus);
     if (bus->ended || bus->admin_count == IO_ADMIN_MAX)
         return leave(bus, bus->ended ? IO_CLOSED : IO_FULL);
-    struct can_frame *frame = &bus->admin[(bus->admin_first + bus->admin_count++) % IO_ADMIN_MAX];
+    size_t at = bus->admin_count++;
+    if (io_is_stop(can_id)) {
+        bus->admin_first = (bus->admin_first + IO_ADMIN_MAX - 1) % IO_ADMIN_MAX;
+        at = 0;
+    }
+    struct can_frame *frame = &bus->admin[(bus->admin_first + at) % IO_ADMIN_MAX];
     *frame = (struct can_frame){.can_id = can_id, .can_dlc = (uint8_t)size};
     memcpy(frame->data, data, size);
     if (bus->admin_count > bus->stats.admin_max)

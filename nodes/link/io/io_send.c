@@ -11,8 +11,12 @@ struct outlet {
     uint64_t left; // frames (a serial line: bytes) for which the kernel's queue has room
 };
 
+static int fits_frame(const struct outlet *outlet) {
+    return outlet->room - outlet->size >= IO_FRAME_SIZE;
+}
+
 static int has_room(const struct outlet *outlet) {
-    return outlet->room - outlet->size >= IO_FRAME_SIZE && outlet->left > 0;
+    return fits_frame(outlet) && outlet->left > 0;
 }
 
 static void spend(struct io_bus *bus, enum link_class kind, uint32_t bits) {
@@ -26,17 +30,20 @@ static uint32_t put_frame(struct io_bus *bus, struct outlet *outlet, enum link_c
     memcpy(frame.data, data, size);
     memcpy(outlet->out + outlet->size, &frame, IO_FRAME_SIZE);
     outlet->size += IO_FRAME_SIZE;
-    outlet->left--;
+    outlet->left -= outlet->left > 0; // a stop needs none
     uint32_t bits = io_frame_bits(bus, can_id, data, size);
     bus->stats.frames_sent++;
     spend(bus, kind, bits);
     return bits;
 }
 
-// They are few and bounded, and an emergency stop may be among them: no budget.
+// They are few and bounded: no budget. A stop does not wait for room either, nor for the end of a pause: what
+// waits in the kernel is an estimate, from a bit rate that a node told.
 static void send_admin(struct io_bus *bus, struct outlet *outlet) {
-    while (bus->admin_count && has_room(outlet)) {
+    while (bus->admin_count) {
         const struct can_frame *frame = &bus->admin[bus->admin_first];
+        if (io_is_stop(frame->can_id) ? !fits_frame(outlet) : !has_room(outlet))
+            return;
         put_frame(bus, outlet, LINK_CONTROL, frame->can_id, frame->data, frame->can_dlc);
         bus->admin_first = (bus->admin_first + 1) % IO_ADMIN_MAX;
         bus->admin_count--;

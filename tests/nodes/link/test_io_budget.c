@@ -192,6 +192,31 @@ static void a_full_queue_is_waited_for_only_with_something_to_send(void) {
     io_free(scene.bus);
 }
 
+// What waits in the kernel is an estimate from a bit rate that a node told: a stop goes whatever that says,
+// and before the frames that were queued first.
+static void a_stop_waits_neither_for_the_queue_nor_for_other_frames(void) {
+    struct scene scene;
+    static const uint8_t stop[6] = {0};
+    uint8_t out[ROOM];
+    open(&scene, IO_CAN_STREAM, NODE, &full_speed);
+    scene.now_ns += 1000 * MS;
+    send_of(&scene, LINK_CONTROL, 1);
+    for (unsigned can_id = DATA_ID; can_id < DATA_ID + 2; can_id++)
+        CHECK_EQUAL(io_send_frame(scene.bus, can_id, stop, 1), IO_OK);
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
+    for (int i = 0; i < 3; i++)
+        CHECK_EQUAL(io_send_frame(scene.bus, DATA_ID - 1, stop, sizeof stop), IO_OK);
+    CHECK_EQUAL(one_round(&scene, 3 * FRAME - 1, 12), 2 * FRAME);
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), FRAME); // and nothing with it
+    CHECK_EQUAL(one_round(&scene, ROOM, 12), 0);
+    check_deadline(&scene, 9 * 120000);
+    CHECK_EQUAL(io_send_frame(scene.bus, DATA_ID - 1, stop, sizeof stop), IO_OK);
+    CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 10, out, sizeof out), 2 * FRAME); // it takes room
+    CHECK(out[0] == 0xFF && out[1] == 0x00);
+    CHECK(out[FRAME] == 0x00 && out[FRAME + 1] == 0x01); // the first of the others
+    io_free(scene.bus);
+}
+
 // -------------------------------------------------------------------------------------------------- reading
 
 static void send_motion(struct scene *scene, int count) {
@@ -367,6 +392,7 @@ int main(void) {
     the_budget_holds_bulk_back_until_it_is_paid();
     a_full_queue_and_a_spent_budget_wait_for_the_sooner();
     a_full_queue_is_waited_for_only_with_something_to_send();
+    a_stop_waits_neither_for_the_queue_nor_for_other_frames();
     acknowledgements_of_motion_wait_until_more_can_be_sent();
     an_answer_to_what_motion_took_along_is_awaited();
     a_slow_bus_is_read_meanwhile();
