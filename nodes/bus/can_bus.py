@@ -97,9 +97,7 @@ class CanBus(BusBase):
         self._pulses = None
         for task in tasks:
             task.cancel()
-        for result in await asyncio.gather(*tasks, return_exceptions=True):
-            if isinstance(result, Exception):
-                raise result  # a bug in those tasks, which handle every expected error
+        await asyncio.gather(*tasks, return_exceptions=True)  # _report_bug has reported what is a bug
         await super().close()
 
     def emergency_stop(self) -> None:
@@ -186,6 +184,7 @@ class CanBus(BusBase):
         )
         # From the start, so that the clocks agree when the nodes are ready.
         self._pulses = loop.create_task(keeper.run())
+        self._pulses.add_done_callback(self._report_bug)
 
     def _frame_handler(self) -> OnFrame:
         return self._handle_frame
@@ -241,12 +240,20 @@ class CanBus(BusBase):
             task = asyncio.get_running_loop().create_task(self._resolve(uuid, node))
             self._doubts[uuid] = task
             task.add_done_callback(lambda _: self._doubts.pop(uuid, None))
+            task.add_done_callback(self._report_bug)
 
     async def _resolve(self, uuid: Uuid, node: Node) -> None:
         if await node.lives():
             self._say(uuid, f"{_twins(uuid, self.name)}; the second one waits for an id and is not used")
         else:
             node.restarted("its uuid requests an id again")
+
+    def _report_bug(self, task: asyncio.Task[None]) -> None:
+        """Report why TASK ended, which is only cancelled and handles every expected error."""
+        bug = None if task.cancelled() else task.exception()
+        if bug is not None:
+            self._on_notice(f"watching bus {self.name} failed ({bug!r}); this is a bug, please report it")
+            task.get_loop().call_exception_handler({"message": "watching a bus failed", "exception": bug})
 
     def _say(self, uuid: Uuid, sentence: str) -> None:
         """Notify the user, once for each board."""

@@ -216,18 +216,24 @@ class PulseKeeper:
 
     async def run(self) -> None:
         """Send pulses and query the nodes until cancelled; a failure of the bus is handled elsewhere."""
-        while True:
-            nodes = self._capable()
-            if len(nodes) < 2:
-                self.rounds.forget()
-                self._publish(())
-                await asyncio.sleep(IDLE_S)
-                continue
-            with contextlib.suppress(CanductorError):  # the bus closes: that is reported elsewhere
-                await self._round(nodes)
-            self._publish(nodes)
-            pause_s = SETTLE_INTERVAL_S if self.rounds.settling else INTERVAL_S
-            await sleep_between(pause_s, pause_s * (1 + SLACK))
+        try:
+            while True:
+                await self._keep()
+        finally:
+            self._publish(())  # nothing keeps the fits up to date any more
+
+    async def _keep(self) -> None:
+        nodes = self._capable()
+        if len(nodes) < 2:
+            self.rounds.forget()
+            self._publish(())
+            await asyncio.sleep(IDLE_S)
+            return
+        with contextlib.suppress(CanductorError):  # the bus closes: that is reported elsewhere
+            await self._round(nodes)
+        self._publish(nodes)
+        pause_s = SETTLE_INTERVAL_S if self.rounds.settling else INTERVAL_S
+        await sleep_between(pause_s, pause_s * (1 + SLACK))
 
     async def _round(self, nodes: Sequence[PulseNode]) -> None:
         seq = self.rounds.next_pulse({node.name: node.clock_freq_hz for node in nodes})

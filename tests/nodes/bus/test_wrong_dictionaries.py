@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from nodes.bus.can_bus import BUS_STOP_FRAMES, CanBus
+from nodes.clock.sync_pulse import PulseKeeper
 from nodes.node.errors import NodeError
 from nodes.node.states import NodeState
 from nodes.support.can_protocol import BUS_STOP_ID
@@ -19,13 +20,15 @@ STOPPING = source_of(config={"CLOCK_FREQ": 1_000_000, "CAN_BUS_STOP": 1})
 
 
 class Pair:
-    """A bus with a sound node and FAN, an optional one."""
+    """A bus with a sound node and FAN, an optional one; what the bus said, and what the loop was told."""
 
     def __init__(self, fan: TwinNode) -> None:
         fan.uuid = uuid(2)
         self.sound_twin = TwinNode(uuid(1), source=STOPPING)
         self.io = TwinIO([self.sound_twin, fan])
-        self.bus = CanBus("can0", self.io)
+        self.notices: list[str] = []
+        self.bugs: list[dict[str, Any]] = []
+        self.bus = CanBus("can0", self.io, on_notice=self.notices.append)
         self.sound = self.bus.add_node("mainboard", uuid(1), make_config())
         self.fan = self.bus.add_node("fan", uuid(2), make_config(), may_be_absent=True)
 
@@ -33,6 +36,7 @@ class Pair:
         """Start the bus, stop it in an emergency and close it."""
 
         async def main() -> None:
+            asyncio.get_running_loop().set_exception_handler(lambda _, context: self.bugs.append(context))
             await self.bus.start()
             assert self.sound.state is NodeState.READY
             self.bus.emergency_stop()
@@ -87,3 +91,15 @@ def test_a_sync_pulse_that_is_answered_without_its_number_fails_the_node_alone()
     pair = Pair(firmware(responses=responses))
     pair.start_and_stop()
     assert "has no response 'sync_pulse seq clock' and cannot be driven" in str(pair.fan.failure)
+
+
+def test_a_bug_in_the_sync_pulses_is_reported_and_keeps_no_bus_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def stumble(_: PulseKeeper) -> None:
+        raise KeyError("seq")
+
+    monkeypatch.setattr(PulseKeeper, "run", stumble)
+    pair = Pair(TwinNode())
+    pair.start_and_stop()
+    (bug,) = pair.bugs
+    assert isinstance(bug["exception"], KeyError)
+    assert pair.notices == ["watching bus can0 failed (KeyError('seq')); this is a bug, please report it"]

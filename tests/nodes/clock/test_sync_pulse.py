@@ -503,6 +503,28 @@ def test_a_clock_by_pulses_goes_through_the_reference_both_ways() -> None:
     keep(bus, 5.0, look)
 
 
+def test_a_keeper_that_ends_leaves_no_fit_in_use() -> None:
+    bus = Bus(1, 0.0)
+    _, second = two_nodes(bus)
+
+    async def main() -> None:
+        broken = False
+
+        def capable() -> list[FakeNode]:
+            assert not broken
+            return bus.nodes
+
+        task = asyncio.create_task(PulseKeeper(capable, bus.send_frame, now).run())
+        await asyncio.sleep(5.0)
+        assert second.pulse_clock is not None
+        broken = True
+        with pytest.raises(AssertionError):
+            await task
+        assert second.pulse_clock is None
+
+    virtual_time.run(main())
+
+
 def test_a_lonely_node_is_looked_at_four_times_a_second_for_company() -> None:
     looks: list[float] = []
 
