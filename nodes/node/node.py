@@ -319,12 +319,26 @@ class Node:
         while True:
             found = await self._reach(absence)
             keeper = self._start_clock()
-            wanted = self._build_config(self.dictionary)
+            wanted = self._wanted()
             why = self._why_reset(found, wanted)
             cleared = await self._clear(methods, used, why) if why else found
             if cleared is not None:
                 return keeper, wanted, cleared
             absence = self._absence(BACK_WITHIN_S, f"it was reset because {why}")
+
+    def _wanted(self) -> NodeConfig:
+        """Return what the node is to be configured as; a bug in that is reported and fails only this node."""
+        try:
+            return self._build_config(self.dictionary)
+        except CanductorError:
+            raise
+        except Exception as bug:  # noqa: BLE001 (it may depend on what the dictionary says)
+            context = {"message": f"building the configuration of node {self.name} failed", "exception": bug}
+            asyncio.get_running_loop().call_exception_handler(context)
+            raise NodeError(
+                f"the configuration of node {self.name} cannot be built ({bug!r}); "
+                "this is a bug, please report it"
+            ) from None
 
     def _absence(self, limit_s: float, after: str) -> Absence:
         return Absence(self.name, limit_s, after, self._on_notice)

@@ -9,6 +9,9 @@ import pytest
 
 from nodes.bus.can_bus import BUS_STOP_FRAMES, CanBus
 from nodes.clock.sync_pulse import PulseKeeper
+from nodes.dictionary.dictionary import Dictionary
+from nodes.node.config import NodeConfig
+from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeError
 from nodes.node.states import NodeState
 from nodes.support.can_protocol import BUS_STOP_ID
@@ -22,7 +25,7 @@ STOPPING = source_of(config={"CLOCK_FREQ": 1_000_000, "CAN_BUS_STOP": 1})
 class Pair:
     """A bus with a sound node and FAN, an optional one; what the bus said, and what the loop was told."""
 
-    def __init__(self, fan: TwinNode) -> None:
+    def __init__(self, fan: TwinNode, build: BuildConfig | None = None) -> None:
         fan.uuid = uuid(2)
         self.sound_twin = TwinNode(uuid(1), source=STOPPING)
         self.io = TwinIO([self.sound_twin, fan])
@@ -30,7 +33,7 @@ class Pair:
         self.bugs: list[dict[str, Any]] = []
         self.bus = CanBus("can0", self.io, on_notice=self.notices.append)
         self.sound = self.bus.add_node("mainboard", uuid(1), make_config())
-        self.fan = self.bus.add_node("fan", uuid(2), make_config(), may_be_absent=True)
+        self.fan = self.bus.add_node("fan", uuid(2), build or make_config(), may_be_absent=True)
 
     def start_and_stop(self) -> None:
         """Start the bus, stop it in an emergency and close it."""
@@ -91,6 +94,20 @@ def test_a_sync_pulse_that_is_answered_without_its_number_fails_the_node_alone()
     pair = Pair(firmware(responses=responses))
     pair.start_and_stop()
     assert "has no response 'sync_pulse seq clock' and cannot be driven" in str(pair.fan.failure)
+
+
+def test_a_bug_in_building_a_configuration_fails_its_node_alone_and_is_reported() -> None:
+    def build(_: Dictionary) -> NodeConfig:
+        raise ZeroDivisionError("by it")
+
+    pair = Pair(TwinNode(), build)
+    pair.start_and_stop()
+    (bug,) = pair.bugs
+    assert isinstance(bug["exception"], ZeroDivisionError)
+    assert str(pair.fan.failure) == (
+        "the configuration of node fan cannot be built (ZeroDivisionError('by it')); this is a bug, please"
+        " report it"
+    )
 
 
 def test_a_bug_in_the_sync_pulses_is_reported_and_keeps_no_bus_open(monkeypatch: pytest.MonkeyPatch) -> None:
