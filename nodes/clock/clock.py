@@ -19,6 +19,7 @@ from typing import Final, NamedTuple, NewType
 from nodes.clock.blend import Blend
 from nodes.clock.fit import RATE_SD, Filter
 from nodes.clock.start import START_SAMPLES, Start
+from nodes.support.errors import CanductorError
 
 HostTime = NewType("HostTime", int)
 """Nanoseconds of the host's CLOCK_MONOTONIC."""
@@ -47,6 +48,8 @@ GAP_NS: Final = 600_000_000_000
 """Silence after which the filter starts again: the temperature may have changed arbitrarily."""
 AHEAD_S: Final = 1.0
 """Time after a sample for which the error bound holds."""
+UPTIME_MAX_S: Final = 3e8
+"""Nearly ten years: ticks fit the integers that count them, and print time keeps a resolution of 0.1 µs."""
 CONFIDENCE: Final = 4.0
 """Standard deviations in the published error bound."""
 _HALF: Final = 1 << 31
@@ -148,10 +151,19 @@ class ClockEstimator:
         return min(self._round_trips_s, default=0.0)
 
     def begin(self, sent_ns: int, received_ns: int, high: int, clock32: int) -> bool:
-        """Start, or start again, with an answer to get_uptime. Return whether it was usable."""
+        """Start, or start again, with an answer to get_uptime. Return whether it was usable.
+
+        Raises CanductorError when the node cannot have run for so long (UPTIME_MAX_S).
+        """
+        ticks = Ticks(high * _WHOLE + clock32 % _WHOLE)
+        if not 0 <= ticks <= UPTIME_MAX_S * self._freq_hz:
+            raise CanductorError(
+                f"its clock cannot be right: an uptime of {ticks} ticks at {self._freq_hz} Hz; "
+                "power-cycle it, and if that does not help flash its firmware again"
+            )
         self._estimate = None
         self.accepted = 0
-        return self._take(sent_ns, received_ns, Ticks(high * _WHOLE + clock32 % _WHOLE))
+        return self._take(sent_ns, received_ns, ticks)
 
     def add(self, sent_ns: int, received_ns: int, clock32: int) -> bool:
         """Process the clock's low 32 bits as read: SENT_NS 0 means unknown. Return whether it was usable."""

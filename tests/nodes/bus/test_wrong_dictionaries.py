@@ -1,4 +1,4 @@
-"""A node with a wrong dictionary fails itself: its bus and the others go on."""
+"""A node with a wrong dictionary, or with wrong answers, fails itself: its bus and the others go on."""
 
 import asyncio
 import json
@@ -12,11 +12,11 @@ from nodes.clock.sync_pulse import PulseKeeper
 from nodes.dictionary.dictionary import Dictionary
 from nodes.node.config import NodeConfig
 from nodes.node.connector import BuildConfig
-from nodes.node.errors import NodeError
+from nodes.node.errors import NodeError, NodeLost
 from nodes.node.states import NodeState
 from nodes.support.can_protocol import BUS_STOP_ID
 from tests.nodes import virtual_time
-from tests.nodes.machine import make_config, uuid
+from tests.nodes.machine import Machine, make_config, uuid
 from tests.nodes.twin_bus import TwinIO, TwinNode, source_of
 
 STOPPING = source_of(config={"CLOCK_FREQ": 1_000_000, "CAN_BUS_STOP": 1})
@@ -120,3 +120,11 @@ def test_a_bug_in_the_sync_pulses_is_reported_and_keeps_no_bus_open(monkeypatch:
     (bug,) = pair.bugs
     assert isinstance(bug["exception"], KeyError)
     assert pair.notices == ["watching bus can0 failed (KeyError('seq')); this is a bug, please report it"]
+
+
+def test_an_uptime_that_cannot_be_is_refused() -> None:
+    machine = Machine(TwinNode(start_ticks=2**63))
+    wanted = r"lost node mainboard: its clock cannot be right: an uptime of 922337\d{13} ticks at 1000000 Hz"
+    with pytest.raises(NodeLost, match=wanted):
+        machine.run(machine.bus.start)
+    assert not machine.estimates

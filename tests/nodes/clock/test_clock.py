@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from nodes.clock.clock import (
     SETTLE_SAMPLES,
+    UPTIME_MAX_S,
     ClockEstimate,
     ClockEstimator,
     HostTime,
@@ -17,6 +18,7 @@ from nodes.clock.clock import (
     extend32,
     ticks_since,
 )
+from nodes.support.errors import CanductorError
 
 FREQ_HZ = 168_000_000
 SECOND_NS = 1_000_000_000
@@ -212,6 +214,16 @@ def test_the_first_sample_must_have_sound_times_too() -> None:
     assert not estimator.begin(0, SECOND_NS, 0, 5)
     with pytest.raises(RuntimeError):
         estimator.estimate()
+
+
+def test_an_uptime_of_more_than_ten_years_is_refused() -> None:
+    estimator = ClockEstimator(FREQ_HZ)
+    last = round(UPTIME_MAX_S * FREQ_HZ)
+    assert estimator.begin(1, SECOND_NS, last >> 32, last % WHOLE)
+    for ticks in (last + 1, 2**63, 2**64 - 1, -1):
+        with pytest.raises(CanductorError, match=f"an uptime of {ticks} ticks at {FREQ_HZ} Hz; power-cycle"):
+            estimator.begin(1, SECOND_NS, ticks >> 32, ticks % WHOLE)
+    assert estimator.estimate().at_ticks == last, "what was known before is still"
 
 
 def test_first_a_burst_then_ever_slower_to_one_a_second() -> None:
