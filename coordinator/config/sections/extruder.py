@@ -14,6 +14,7 @@ from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import UNSUPPORTED_EXTRUDER_OPTIONS
 from coordinator.kinematics.base import FILAMENT, StepFunction, WorkSpace
 from coordinator.motion.specs import MotionLimits
+from coordinator.motion.steps.steps import SMOOTH_MAX_S, SMOOTH_MIN_S
 from coordinator.support.quoting import nearest_or_all
 
 NOZZLE_DIAMETER = FloatOption(
@@ -66,8 +67,8 @@ SMOOTH_TIME = FloatOption(
     help="window over which pressure advance is spread",
     default=0.04,
     unit="s",
-    above=0,
-    maximum=0.2,
+    minimum=SMOOTH_MIN_S,
+    maximum=SMOOTH_MAX_S,
 )
 EXTRUDER = SectionSpec(
     help="An extruder's stepper and the limits of its filament; further ones are extruder1, extruder2, …",

@@ -25,11 +25,11 @@ from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.kinematics.dual_carriage import CarriageMode, CarriageState, DualCarriage
 from coordinator.motion.planner.planner import FeedStatus
 from coordinator.motion.steps.shapers import check_reach, split_kind
+from coordinator.motion.steps.steps import SMOOTH_MAX_S, SMOOTH_MIN_S
 from coordinator.motion.steps.surface import Surface
 
 MAX_FREQUENCY_HZ = 1000.0
 MAX_ADVANCE_S = 10.0
-MAX_SMOOTH_S = 0.2
 MIN_ROTATION_MM = 0.1
 MAX_ROTATION_MM = 10_000.0
 NO_TOOLS_FROM = 100
@@ -122,7 +122,11 @@ def set_pressure_advance(job: ProgramContext, command: Command) -> bool:
             return True
     extruder = _extruder(job, command, name)
     advance = bounded(command, values, "ADVANCE", None, low=0, high=MAX_ADVANCE_S)
-    smooth = bounded(command, values, "SMOOTH_TIME", None, low=0, high=MAX_SMOOTH_S)
+    smooth = bounded(command, values, "SMOOTH_TIME", None, low=0, high=SMOOTH_MAX_S)
+    if smooth is not None and 0 < smooth < SMOOTH_MIN_S:
+        raise WordError(
+            f"SMOOTH_TIME of {command.name} is {smooth:g}; give 0, or {SMOOTH_MIN_S:g} s and more"
+        )
     smooth_s = extruder.smooth_s if smooth is None else smooth
     window = smooth_s if advance or extruder.window_s else 0.0
     if window != extruder.window_s:

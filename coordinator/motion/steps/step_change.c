@@ -274,7 +274,8 @@ int step_set_weights(struct step_gen *gen, int stepper, const double *weights) {
 }
 
 int step_set_smooth_time(struct step_gen *gen, int stepper, double smooth_s) {
-    if (stepper < 0 || stepper >= gen->stepper_count || !(smooth_s == 0 || step_in_range(smooth_s, 1e-4, 1)))
+    const bool is_window = smooth_s >= STEP_SMOOTH_MIN_US / 1e6 && smooth_s <= STEP_SMOOTH_MAX_US / 1e6;
+    if (stepper < 0 || stepper >= gen->stepper_count || !(smooth_s == 0 || is_window))
         return STEP_BAD_CONFIG;
     if (!may_change(gen))
         return STEP_NOT_IDLE;

@@ -41,6 +41,8 @@ enum {
     STEP_TABLE_POINTS = 1024,  // of one axis' table
     STEP_SURFACE_POINTS = 256, // of a surface, along X and along Y
     STEP_SLACK_TICKS = 2,      // room for rounding that steps need beyond what the pulses need
+    STEP_SMOOTH_MIN_US = 100,  // of a smooth time, but for 0
+    STEP_SMOOTH_MAX_US = 200000,
 };
 
 enum step_status {
@@ -206,8 +208,8 @@ int step_set_shaper(struct step_gen *gen, int axis, int n, const double *amplitu
 // The stepper follows other axes from now on, without a step. STEP_NOT_IDLE unless all has settled.
 int step_set_weights(struct step_gen *gen, int stepper, const double *weights);
 
-// The stepper's E part is E + pressure_advance·E', weighted by a triangle of full width SMOOTH_S. 0: plain E.
-// STEP_NOT_IDLE unless all has settled.
+// The stepper's E part is E + pressure_advance·E', weighted by a triangle of full width SMOOTH_S, from
+// STEP_SMOOTH_MIN_US to STEP_SMOOTH_MAX_US. 0: plain E. STEP_NOT_IDLE unless all has settled.
 int step_set_smooth_time(struct step_gen *gen, int stepper, double smooth_s);
 
 // How far (s) step times depend on moves later than themselves: so much more is held back without a flush.

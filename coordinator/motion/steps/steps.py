@@ -12,6 +12,9 @@ from nodes.support.c_structs import from_struct
 
 MAX_ERROR_S = 12.5e-6
 """How far a step may be from its true time by default."""
+SMOOTH_MIN_S = int(lib.STEP_SMOOTH_MIN_US) / 1e6
+SMOOTH_MAX_S = int(lib.STEP_SMOOTH_MAX_US) / 1e6
+"""Of a smooth time, but for 0."""
 TABLE_POINTS_MAX = int(lib.STEP_TABLE_POINTS)
 """Points of one axis table that step generation has room for."""
 Position = tuple[float, float, float, float]
@@ -290,7 +293,7 @@ class StepGenerator:
     def set_smooth_time(self, stepper: int, smooth_s: float) -> None:
         """Smooth STEPPER's E and its pressure advance by a triangle of full width SMOOTH_S; 0: neither.
 
-        Raises StepError unless all has settled.
+        SMOOTH_S: 0, or from SMOOTH_MIN_S to SMOOTH_MAX_S. Raises StepError unless all has settled.
         """
         self._check_stepper(stepper)
         status = lib.step_set_smooth_time(self._gen, stepper, smooth_s)

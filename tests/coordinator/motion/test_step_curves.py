@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from coordinator.config.options import BadValue
+from coordinator.config.sections.extruder import SMOOTH_TIME
 from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps.errors import StepError
 from coordinator.motion.steps.shapers import SHAPER_KINDS, shaper_impulses
@@ -245,6 +247,18 @@ def test_nothing_changes_while_the_machine_moves() -> None:
         run.gen.set_smooth_time(0, 0.02)
     with pytest.raises(StepError, match=refused):
         run.gen.set_weights(0, (0.0, 0.0, 0.0, 0.0))
+
+
+def test_a_configuration_has_no_smooth_time_that_step_generation_refuses() -> None:
+    """Failed before: 0.05 ms was loaded, and then no start succeeded."""
+    run = Run([stepper(0, (1.0, 0.0, 0.0, 1.0))], [node_spec()])
+    for text in ("0.0001", "0.2"):
+        run.gen.set_smooth_time(0, SMOOTH_TIME.parse(text))
+    for text in ("0.00005", "0.000099", "0.201"):
+        with pytest.raises(BadValue):
+            SMOOTH_TIME.parse(text)
+        with pytest.raises(StepError, match="out of range"):
+            run.gen.set_smooth_time(0, float(text))
 
 
 def test_a_bad_shaper_is_refused() -> None:

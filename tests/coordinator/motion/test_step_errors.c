@@ -95,7 +95,8 @@ static void what_there_is_not_is_refused(void) {
     CHECK_EQUAL(step_set_shaper(gen, 0, STEP_IMPULSES + 1, &one, zeros), STEP_BAD_CONFIG);
     CHECK_EQUAL(step_set_shaper(gen, 0, 2, two, times), STEP_BAD_CONFIG);  // more than 1 in all
     CHECK_EQUAL(step_set_shaper(gen, 0, 1, &one, &late), STEP_BAD_CONFIG); // not centred
-    CHECK_EQUAL(step_set_smooth_time(gen, 0, 1e-5), STEP_BAD_CONFIG);
+    CHECK_EQUAL(step_set_smooth_time(gen, 0, 0.99e-6 * STEP_SMOOTH_MIN_US), STEP_BAD_CONFIG);
+    CHECK_EQUAL(step_set_smooth_time(gen, 0, 1.01e-6 * STEP_SMOOTH_MAX_US), STEP_BAD_CONFIG);
     CHECK_EQUAL(step_set_table(gen, 0, 1, rising, even, even, 1), STEP_BAD_CONFIG);
     CHECK_EQUAL(step_set_table(gen, 0, STEP_TABLE_POINTS + 1, rising, even, even, 1), STEP_BAD_CONFIG);
     CHECK_EQUAL(step_set_table(gen, 0, 3, falling, even, even, 1), STEP_BAD_CONFIG);

@@ -223,6 +223,21 @@ BAD: dict[str, tuple[str, str, str, str]] = {
             " motion it follows, has 0.04; one motion has one pressure advance: remove the option here"
         ),
     ),
+    "extruder whose smooth time no step generation takes": (
+        "extruders",
+        "pressure_advance: 0.04\n",
+        "pressure_advance: 0.04\npressure_advance_smooth_time: 0.00005\n",
+        (
+            "option 'pressure_advance_smooth_time' of [extruder] is '0.00005', must be a number in s, at"
+            " least 0.0001 and at most 0.2"
+        ),
+    ),
+    "the same of a follower": (
+        "extruders",
+        "extruder: extruder\n",
+        "extruder: extruder\npressure_advance_smooth_time: 0.00005\n",
+        "option 'pressure_advance_smooth_time' of [extruder_stepper feeder] is '0.00005', must be",
+    ),
     "two steppers of one name": (
         "extruders",
         "[extruder_stepper feeder]",

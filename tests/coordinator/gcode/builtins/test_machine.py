@@ -307,6 +307,14 @@ def test_another_way_per_turn_holds_from_a_standstill_on() -> None:
             ":1: ADVANCE of SET_PRESSURE_ADVANCE is 'x', which is",
         ),
         (
+            ["SET_PRESSURE_ADVANCE ADVANCE=0.05 SMOOTH_TIME=0.00001"],
+            ":1: SMOOTH_TIME of SET_PRESSURE_ADVANCE is 1e-05; give 0, or 0.0001 s and more",
+        ),
+        (
+            ["SET_PRESSURE_ADVANCE SMOOTH_TIME=0.21"],
+            ":1: SMOOTH_TIME of SET_PRESSURE_ADVANCE is 0.21; 0 to 0.2 are possible",
+        ),
+        (
             ["SET_PRESSURE_ADVANCE EXTRUDER=e ADVANCE=1"],
             ":1: SET_PRESSURE_ADVANCE names the extruder 'e'",
         ),
