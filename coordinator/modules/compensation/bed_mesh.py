@@ -45,6 +45,8 @@ from nodes.support.errors import CanductorError
 DEFAULT_PROFILE: Final = "default"
 PROFILES_MAX: Final = 50
 """That a program may make; clients get all of them."""
+DUMPED_MAX: Final = 1000
+"""Points of a grid that a client may ask about; they are found and written on the control loop."""
 RESTORE: Final = "_BED_MESH_RESTORE"
 
 
@@ -90,6 +92,8 @@ class BedMesh(Module):
         """The same as front ends get them."""
         self._settings: MeshSettings | None = None
         self._points: ProbePoints | None = None
+        self._calibration: dict[str, Value] = {}
+        """Where BED_MESH_CALIBRATE probes without parameters."""
         self._limits = build.machine.limits
         self._mesh: Mesh | None = None
         self._surface: Surface | None = None
@@ -116,6 +120,8 @@ class BedMesh(Module):
     def set_up(self, settings: MeshSettings, points: ProbePoints) -> None:
         """Take over what the plain section says."""
         self._settings, self._points = settings, points
+        algorithm = fitting_algorithm(settings.algorithm, settings.grid.counts)
+        self._calibration = _calibration(settings, settings.grid, algorithm)
 
     def link(self, modules: Modules) -> None:
         """Find the probe, without which the bed is probed by hand; raises NotSupported."""
@@ -166,7 +172,7 @@ class BedMesh(Module):
     def dump(self, parameters: Mapping[str, object]) -> Mapping[str, Value]:
         """Return the mesh, all profiles, and where BED_MESH_CALIBRATE would probe; raises WordError.
 
-        PARAMETERS are those of that command, by name.
+        PARAMETERS are those of that command, by name; with them it has DUMPED_MAX points at most.
         """
         mesh, found = self._mesh, self.status()
         current: dict[str, Value] = {}
@@ -181,7 +187,7 @@ class BedMesh(Module):
         return {
             "current_mesh": current,
             "profiles": found["profiles"],
-            "calibration": self._planned(parameters),
+            "calibration": self._planned(parameters) if parameters else self._calibration,
             "probe_offsets": [*offset],
             "axis_minimum": [*self._limits.position_min, 0.0],
             "axis_maximum": [*self._limits.position_max, 0.0],
@@ -195,22 +201,12 @@ class BedMesh(Module):
         text = " ".join(f'{name}="{value}"' for name, value in each)
         command = Command("BED_MESH_CALIBRATE", text)
         grid, algorithm = self._wanted(command)
-        path: list[Value] = [[x, y] for x, y in grid.places()]
-        settings = self._settings
-        config: dict[str, Value] = {
-            "x_count": grid.counts[0],
-            "y_count": grid.counts[1],
-            "mesh_x_pps": settings.pps[0],
-            "mesh_y_pps": settings.pps[1],
-            "algo": algorithm,
-            "tension": settings.tension,
-            "min_x": grid.minimum[0],
-            "max_x": grid.maximum[0],
-            "min_y": grid.minimum[1],
-            "max_y": grid.maximum[1],
-        }
-        rapid: list[Value] = [[place, True] for place in path]
-        return {"points": path, "config": config, "probe_path": path, "rapid_path": rapid}
+        if math.prod(grid.counts) > DUMPED_MAX:
+            raise WordError(
+                f"{command.name}: a mesh of {grid.counts[0]}, {grid.counts[1]} points is too large to be"
+                f" asked about, {DUMPED_MAX:,} are possible; ask for fewer, or without parameters"
+            )
+        return _calibration(self._settings, grid, algorithm)
 
     # ------------------------------------------------------------------------------------ after a crash
 
@@ -434,6 +430,25 @@ class BedMesh(Module):
         if self._mesh is None:
             raise WordError(f"{call.command.name}: no mesh is followed; BED_MESH_CALIBRATE probes one")
         return self._mesh
+
+
+def _calibration(settings: MeshSettings, grid: Grid, algorithm: str) -> dict[str, Value]:
+    """Return where GRID is probed, as front ends get it."""
+    path: list[Value] = [[x, y] for x, y in grid.places()]
+    config: dict[str, Value] = {
+        "x_count": grid.counts[0],
+        "y_count": grid.counts[1],
+        "mesh_x_pps": settings.pps[0],
+        "mesh_y_pps": settings.pps[1],
+        "algo": algorithm,
+        "tension": settings.tension,
+        "min_x": grid.minimum[0],
+        "max_x": grid.maximum[0],
+        "min_y": grid.minimum[1],
+        "max_y": grid.maximum[1],
+    }
+    rapid: list[Value] = [[place, True] for place in path]
+    return {"points": path, "config": config, "probe_path": path, "rapid_path": rapid}
 
 
 def _pair(numbers: Sequence[Any]) -> Place:
