@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
+from coordinator.gcode.builtins.state import check_room
 from coordinator.gcode.commands import Phases, ProgramAction, ProgramContext, Reading
 from coordinator.gcode.events import (
     PositionSet,
@@ -334,6 +335,7 @@ def save_dual_carriage_state(job: ProgramContext, command: Command) -> bool:
     """NAME: keep what both carriages do."""
     carriages, state = _dual(job, command)
     name = command.only_parameters(("NAME",)).get("NAME", DEFAULT_STATE)
+    check_room(job.machine.saved_carriages, name)
     position = job.planner.toolhead_position[carriages.axis]
     job.machine.saved_carriages[name] = replace(state, positions=state.at(position))
     return True

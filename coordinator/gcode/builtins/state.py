@@ -14,7 +14,7 @@ from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus, Planner
 MOVE_SPEED_MM_S: Final = 50.0
 """Of the moves that these commands make, unless they say otherwise."""
 SAVED_MAX: Final = 100
-"""States that may be kept."""
+"""States of one kind that may be kept."""
 
 
 def _speed(job: ProgramContext, command: Command, values: Mapping[str, str], otherwise_mm_s: float) -> float:
@@ -93,10 +93,14 @@ def save_gcode_state(job: ProgramContext, command: Command) -> bool:
 
 def save_state(job: ProgramContext, name: str) -> None:
     """Keep what holds for the lines to come under NAME; raises WordError."""
-    saved = job.machine.saved
+    check_room(job.machine.saved, name)
+    job.machine.saved[name] = present_state(job.planner)
+
+
+def check_room(saved: Mapping[str, object], name: str) -> None:
+    """Raise WordError where SAVED has no room for another state called NAME."""
     if name not in saved and len(saved) >= SAVED_MAX:
         raise WordError(f"{SAVED_MAX} states are saved already; use one of their names again")
-    saved[name] = present_state(job.planner)
 
 
 def present_state(planner: Planner) -> SavedState:

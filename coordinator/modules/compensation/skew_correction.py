@@ -32,6 +32,8 @@ from coordinator.support.values import Value
 
 SKEW_MAX: Final = 0.2
 """Of any plane: some 11 degrees. More is a mistake of who measured."""
+PROFILES_MAX: Final = 50
+"""That a program may make; clients get all that wait for SAVE_CONFIG."""
 RESTORE: Final = "_SET_SKEW"
 _PLANES: Final = ("XY", "XZ", "YZ")
 
@@ -239,6 +241,8 @@ class Skews(Module):
             raise WordError(
                 f"SKEW_PROFILE: {quoted(name)} cannot be a profile's name; take letters, digits and _"
             )
+        if name not in self._profiles and len(self._profiles) >= PROFILES_MAX:
+            raise WordError(f"SKEW_PROFILE: there are {PROFILES_MAX} profiles already; remove one of them")
         return Immediate((f"skew profile {name} is saved; SAVE_CONFIG writes it",), lambda: self._save(name))
 
     def _remove(self, name: str) -> None:

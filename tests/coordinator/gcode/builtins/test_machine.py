@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from coordinator.gcode.builtins.state import SAVED_MAX
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import (
     End,
@@ -250,6 +251,14 @@ def test_the_carriages_go_back_to_where_they_were() -> None:
     assert state is not None
     assert state.modes == job.machine.saved_carriages["default"].modes
     assert state.at(70) == (70, 170)
+
+
+def test_so_many_states_of_carriages_are_saved_and_no_more() -> None:
+    lines = [f"SAVE_DUAL_CARRIAGE_STATE NAME=s{n}" for n in range(SAVED_MAX)]
+    _, _, job = run(*lines, "SAVE_DUAL_CARRIAGE_STATE NAME=s0")
+    assert len(job.machine.saved_carriages) == SAVED_MAX
+    with pytest.raises(GCodeError, match=f"{SAVED_MAX} states are saved already"):
+        run(*lines, "SAVE_DUAL_CARRIAGE_STATE")
 
 
 def test_another_way_per_turn_holds_from_a_standstill_on() -> None:

@@ -8,7 +8,7 @@ import pytest
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
 from coordinator.gcode.events import PositionSet, WeightsChange
-from coordinator.modules.compensation.skew_correction import Skew, Skews
+from coordinator.modules.compensation.skew_correction import PROFILES_MAX, Skew, Skews
 from tests.stages.program_stage import ProgramStage
 
 PROFILE = "[skew_correction cold]\nxy_skew: 0.01\nxz_skew: -0.002\nyz_skew: 0.003\n"
@@ -74,6 +74,13 @@ def test_the_head_stays_where_it_is_and_is_called_by_another_place(tmp_path: Pat
     assert machine.modules.status()["skew_correction"] == {
         "current_profile_name": "other", "xy_skew": 0.01, "xz_skew": -0.002, "yz_skew": 0.003
     }  # fmt: skip
+
+
+def test_a_program_makes_so_many_profiles_and_no_more(tmp_path: Path) -> None:
+    machine = ProgramStage(tmp_path, PROFILE)
+    machine.run("G28", *(f"SKEW_PROFILE SAVE=p{n}" for n in range(PROFILES_MAX - 1)))
+    assert f"there are {PROFILES_MAX} profiles already" in machine.error("SKEW_PROFILE SAVE=another")
+    machine.run("SKEW_PROFILE SAVE=p0", "SKEW_PROFILE REMOVE=cold", "SKEW_PROFILE SAVE=another")
 
 
 @pytest.mark.parametrize(
