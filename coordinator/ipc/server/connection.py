@@ -161,8 +161,7 @@ class Connection(asyncio.BufferedProtocol):
             waiting = self.session.next_request()
             if waiting is None:
                 return
-            if not self.session.perform(waiting, now_s):
-                self._call(waiting)
+            self._perform(waiting, now_s)
             if self._loop.time() >= until_s:
                 return
 
@@ -207,6 +206,16 @@ class Connection(asyncio.BufferedProtocol):
         self._request_turn()  # the updates of many clients are due at one instant
 
     # ---------------------------------------------------------------------------------------- methods
+
+    def _perform(self, request: Request, now_s: float) -> None:
+        """Have the session perform REQUEST, or call its method."""
+        try:
+            is_done = self.session.perform(request, now_s)
+        except Exception as error:  # noqa: BLE001 (as below)
+            self._fail(request, error)
+        else:
+            if not is_done:
+                self._call(request)
 
     def _call(self, request: Request) -> None:
         with doing(overtaken=request.overtaken):

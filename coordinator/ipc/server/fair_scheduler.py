@@ -16,6 +16,9 @@ RECEIVE_BYTES: Final = 65_536
 class Worker(Protocol):
     """A client's connection."""
 
+    transport: asyncio.Transport
+    """Aborted when ``work`` raises."""
+
     def work(self, until_s: float) -> bool:
         """Do what there is to do, until UNTIL_S by the loop's clock; return whether there is more."""
         ...
@@ -52,7 +55,14 @@ class FairScheduler:
 
     def _run(self, worker: Worker) -> None:
         begun_s = self._now_s()
-        more = worker.work(begun_s + TURN_S)
+        try:
+            more = worker.work(begun_s + TURN_S)
+        except Exception as error:  # noqa: BLE001 (a bug of one turn must not end those of others; it is reported)
+            more = False
+            self._loop.call_exception_handler(
+                {"message": "canductor: the turn of a client failed", "exception": error}
+            )
+            worker.transport.abort()
         self._spent_s += self._now_s() - begun_s
         if more:
             self._wait(worker)

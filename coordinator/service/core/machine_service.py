@@ -7,7 +7,8 @@ import asyncio
 import contextlib
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable
+import traceback
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -139,6 +140,8 @@ class MachineService:
         """When the tree was brought up to date, and when somebody wanted it to be."""
         self._reading = asyncio.Event()
         """Set when ``_refresh`` has to go on: somebody reads the tree."""
+        self._reported = ""
+        """Where the last bug was that kept the tree from being filled."""
         state.bring_up_to_date = self._bring_up_to_date
         self.recovery = Recovery(self, settings.state)
         self.programs = Programs(self, self.recovery)
@@ -566,13 +569,13 @@ class MachineService:
         self._reading.set()
         if self._read_s - self._shown_s >= 2 * REFRESH_S:
             self._shown_s = self._read_s
-            with contextlib.suppress(MachineStopped):
+            with self._showing():
                 self._figures.show(self)
 
     async def _refresh(self) -> None:
         """Keep the tree up to date while it is read; a look at it should find it filled."""
         while True:
-            with contextlib.suppress(MachineStopped):
+            with self._showing():
                 for _ in self._figures.parts(self):
                     await asyncio.sleep(0)
             self._shown_s = self.now_s
@@ -581,6 +584,21 @@ class MachineService:
                 continue
             self._reading.clear()
             await self._reading.wait()
+
+    @contextlib.contextmanager
+    def _showing(self) -> Iterator[None]:
+        """Let the block end where the machine stops, or something has a bug, which is reported once."""
+        try:
+            yield
+        except MachineStopped:
+            pass
+        except Exception as bug:  # noqa: BLE001 (who looks at a machine must not be what ends its display)
+            *_, (frame, line) = traceback.walk_tb(bug.__traceback__)
+            if (place := f"{frame.f_code.co_filename}:{line}") != self._reported:
+                self._reported = place
+                asyncio.get_running_loop().call_exception_handler(
+                    {"message": "canductor: the state could not be brought up to date", "exception": bug}
+                )
 
 
 def _nobody() -> None:

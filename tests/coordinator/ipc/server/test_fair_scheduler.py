@@ -1,6 +1,7 @@
 """Clients share the rounds of the loop; the clock is the test's."""
 
 import asyncio
+from typing import Any
 
 from coordinator.ipc.server.fair_scheduler import ROUND_S, TURN_S, FairScheduler
 
@@ -17,6 +18,15 @@ class Clock:
         return self.now_s
 
 
+class Transport(asyncio.Transport):
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_aborted = False
+
+    def abort(self) -> None:
+        self.is_aborted = True
+
+
 class Client:
     """Has TURNS turns' worth of work, and notes in WORKED when it gets one."""
 
@@ -24,6 +34,7 @@ class Client:
         self.name = name
         self.turns = turns
         self.held = 0
+        self.transport: asyncio.Transport = Transport()
         self._clock = clock
         self._worked = worked
 
@@ -81,3 +92,30 @@ def test_who_asks_little_is_served_at_once_until_the_round_is_spent() -> None:
         assert worked[-1] == "0"
 
     asyncio.run(body())
+
+
+class BrokenClient(Client):
+    def work(self, until_s: float) -> bool:
+        super().work(until_s)
+        raise ZeroDivisionError
+
+
+def test_a_turn_that_fails_ends_its_client_only() -> None:
+    """Failed before: those behind it waited for ever, unless somebody else came."""
+    reports: list[dict[str, Any]] = []
+
+    async def body() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: reports.append(context))
+        clock, worked = Clock(), list[str]()
+        scheduler = FairScheduler(clock)
+        broken = BrokenClient("b", 3, clock, worked)
+        for client in (Client("a", 2, clock, worked), broken, Client("c", 1, clock, worked)):
+            scheduler.request_turn(client)
+        found = await rounds(worked)
+        assert list(map("".join, found)) == ["a", "abc"]
+        scheduler.request_turn(broken)  # the first of its round
+        assert isinstance(broken.transport, Transport)
+        assert broken.transport.is_aborted
+
+    asyncio.run(body())
+    assert [type(report["exception"]) for report in reports] == [ZeroDivisionError] * 2

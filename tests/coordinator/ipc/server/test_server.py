@@ -274,6 +274,23 @@ def test_methods_that_fail(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> 
     assert "the method broken failed" in caplog.text
 
 
+def test_a_bug_in_what_fills_the_state_is_answered(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Failed before: whoever read the state was disconnected."""
+
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    async def body(served: Served) -> None:
+        script = await served.script()
+        served.state.bring_up_to_date = fail
+        for method in ("state.get", "api.watch"):
+            assert (await script.ask(method))["error"]["code"] == "internal"
+        assert (await script.ask("api.ping"))["result"] == {}
+
+    run(tmp_path, body)
+    assert "the method state.get failed" in caplog.text
+
+
 def test_a_script_may_close_its_side_and_still_gets_its_answers(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
         script = await served.script()

@@ -203,6 +203,8 @@ def test_a_client_that_has_left_is_forgotten(tmp_path: Path) -> None:
 class Hog:
     """A client with so much work that others wait for their turn many rounds."""
 
+    transport: asyncio.Transport
+
     def __init__(self, scheduler: FairScheduler) -> None:
         self._scheduler = scheduler
         self.rounds = 20
