@@ -99,5 +99,5 @@ def test_the_check_knows_both_kinds() -> None:
 def test_no_text_takes_the_square_of_its_length() -> None:
     """Failed before: M112 in scripts of the Klippy API, block numbers of DNC, shapers, tables."""
     found = dict(regexes())
-    assert "coordinator.klippy_api.endpoints._EMERGENCY" in found
+    assert "coordinator.service.core.work._EMERGENCY_LINE" in found
     assert [name for name, pattern in found.items() if is_slow(pattern)] == []

@@ -2,7 +2,6 @@
 
 import os
 import platform
-import re
 import sys
 from collections.abc import Awaitable, Callable, Mapping, Sequence, Sized
 from pathlib import Path
@@ -25,7 +24,7 @@ from coordinator.modules.compensation.bed_mesh import BedMesh
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.service.core.machine_service import MachineService
-from coordinator.service.core.work import LINES_MAX
+from coordinator.service.core.work import LINES_MAX, has_emergency
 from coordinator.support.version import VERSION
 from nodes.support.errors import CanductorError
 
@@ -35,10 +34,6 @@ Endpoint = Callable[[Client, Request], Result | Awaitable[Result]]
 APP: Final = "canductor"
 WHO: Final = "a client of the Klippy API"
 MESH_ARGUMENTS_MAX: Final = 32
-_EMERGENCY: Final = re.compile(
-    r"(?:^|(?<=\r))[ \t]*(?:N\d+[ \t]*)?M112\b", re.ASCII | re.IGNORECASE | re.MULTILINE
-)
-"""Within one line: a search looks at each line once, however many there are."""
 _ROOT: Final = Path(__file__).parent.parent.parent
 
 
@@ -187,7 +182,7 @@ class Endpoints:
 
     def _script(self, _client: Client, request: Request) -> Awaitable[Result] | Result:
         script = text_param(request, "script")
-        if _EMERGENCY.search(script):
+        if has_emergency(script):
             self._service.emergency_stop(f"M112 of {WHO}")
             return {}
         check_size(script)
@@ -222,7 +217,7 @@ class Endpoints:
         if request.method == "emergency_stop":
             return WHO
         script = request.params.get("script")
-        if request.method == "gcode/script" and isinstance(script, str) and _EMERGENCY.search(script):
+        if request.method == "gcode/script" and isinstance(script, str) and has_emergency(script):
             return f"M112 of {WHO}"
         return None
 

@@ -126,7 +126,8 @@ class Method:
     parameters; must be a plain function, and require none."""
     stops: Callable[[Caller, dict[str, Any]], str | None] = lambda _caller, _params: None
     """Return whom a call with such parameters names as who stops the machine; None: it does not. In any
-    thread: while the control loop is held, such a call is carried out without it (server/stop_lane.py)."""
+    thread: while the control loop is held, such a call is carried out without it (server/stop_lane.py). It is
+    called as an urgent one is, and must have stopped the machine when it returns."""
 
     def schema(self) -> dict[str, Value]:
         """Return the declaration as "api.methods" shows it."""

@@ -37,6 +37,7 @@ class Request:
     """A request with its parameters, checked. ID is None when no answer is wanted.
 
     IGNORED: what was wrong with an urgent one, which is carried out all the same; empty: nothing.
+    URGENT: it is called at once; so is what stops the machine by its parameters.
     OVERTAKEN: an urgent one came behind it and was called first.
     """
 
@@ -44,6 +45,7 @@ class Request:
     method: Method
     params: dict[str, Any]
     ignored: str = ""
+    urgent: bool = False
     overtaken: bool = False
 
 
@@ -218,10 +220,8 @@ class Session:
         """Return who stops the machine with what waits here and with the UNREAD bytes behind it; else None.
 
         In any thread; the session stays as it is. A twin of it reads the bytes, so that rights are the same.
-        A stop that runs counts: it has not begun, since it ends in its first step.
         """
-        waiting = (*tuple(self._running), *tuple(self._waiting))
-        if self.end_reason is not None or not (unread or self._reader.waiting_bytes or waiting):
+        if self.end_reason is not None or not (unread or self._reader.waiting_bytes):
             return None
         twin = Session(self.context, 0.0, number=self.number, peer=self.peer, granted=self.granted)
         twin.check_token = self._find_token
@@ -229,12 +229,10 @@ class Session:
         twin._reader.feed(unread, 0.0)
         while True:
             before = twin._reader.waiting_bytes
-            waiting = (*twin.read(0.0), *waiting, *twin._waiting)
-            for request in waiting:
+            for request in twin.read(0.0):
                 assert twin.caller is not None
                 if (who := request.method.stops(twin.caller, request.params)) is not None:
                     return who
-            waiting = ()
             twin._waiting.clear()
             twin._ids.clear()
             if twin.end_reason is not None or twin._reader.waiting_bytes == before:
@@ -372,12 +370,11 @@ class Session:
         taken = ""
         if request_id is not None and request_id in self._ids:
             taken = f"the id {request_id} is that of a request without answer yet"
-        if method.urgent:
-            usable, wrong = method.check_urgent(params)
-            return Request(request_id, method, usable, "; ".join(filter(None, (taken, wrong))))
-        if taken:
+        usable, wrong = method.check_urgent(params) if method.urgent else (method.check(params), "")
+        urgent = method.urgent or (self.caller is not None and method.stops(self.caller, usable) is not None)
+        if taken and not urgent:
             raise ApiError("bad_params", taken)
-        return Request(request_id, method, method.check(params))
+        return Request(request_id, method, usable, "; ".join(filter(None, (taken, wrong))), urgent)
 
     def _method(self, name: str) -> Method:
         """Return the method NAME if this client may call it now; raises ApiError."""
@@ -396,7 +393,7 @@ class Session:
         immediate = session_methods.IMMEDIATE_HANDLERS.get(request.method.name)
         if immediate is not None:
             self._perform(request, immediate, now_s)
-        elif request.method.urgent:
+        elif request.urgent:
             urgent.append(request)
             for waiting in self._waiting:
                 waiting.overtaken = True

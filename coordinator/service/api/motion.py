@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Awaitable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -27,6 +27,7 @@ from coordinator.service.core.work import (
     Work,
     WorkError,
     commands_in,
+    has_emergency,
 )
 from coordinator.service.state.figures import axes, position_figures
 from coordinator.streaming.move_source import ProgramOutput
@@ -85,11 +86,10 @@ async def run_script(service: MachineService, script: str, *, wait: bool) -> Scr
 
     While a job prints they are done while_printing it, or between two of its lines.
     """
-    if EMERGENCY not in script.upper():
-        await _take_turn(service)
+    await _take_turn(service)
     lines = _lines(script)
     names = _commands(lines)
-    if EMERGENCY in names:
+    if EMERGENCY in names:  # written in a way that ``has_emergency`` does not look for, such as M0112
         service.emergency_stop(BY_LINE)
         return ScriptOutcome()
     if _restarted(service, names):
@@ -137,8 +137,11 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
     """Return them."""
     steps = _StepsOfNodes(service)
 
-    async def run(_caller: Caller, params: dict[str, Any]) -> Value:
-        return await _run(service, params)
+    def run(caller: Caller, params: dict[str, Any]) -> Awaitable[Value] | Value:
+        if (who := _who_stops(caller, params)) is not None:
+            service.emergency_stop(who)
+            return _answer(())
+        return _run(service, params)
 
     async def move_to(_caller: Caller, params: dict[str, Any]) -> Value:
         return await _move(service, params, relative=False)
@@ -284,10 +287,7 @@ def _axes_of(letters: str) -> str:
 
 
 def _who_stops(_caller: Caller, params: dict[str, Any]) -> str | None:
-    try:
-        return BY_LINE if EMERGENCY in _commands(_lines(params["script"])) else None
-    except CanductorError:
-        return None
+    return BY_LINE if has_emergency(params["script"]) else None
 
 
 def _commands(lines: list[str]) -> list[str]:

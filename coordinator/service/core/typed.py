@@ -9,7 +9,7 @@ import os
 import select
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Final
 
 from coordinator.ipc.protocol.methods import Caller, Registry, Scope
@@ -114,7 +114,8 @@ class Typed:
                 continue
             try:
                 params = self._run.check({"script": line, "wait": False})
-                output = await self._run.call(Caller("the terminal", Scope.OPERATE), params)  # type: ignore[misc]
+                result = self._run.call(Caller("the terminal", Scope.OPERATE), params)
+                output = await result if isinstance(result, Awaitable) else result
             except CanductorError as error:
                 self._say(str(error))
                 continue

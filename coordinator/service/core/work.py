@@ -4,6 +4,7 @@ A work is stepped in the motion worker's thread, where the planner may be touche
 it and is notified of its end.
 """
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +24,10 @@ LINES_MAX: Final = 500
 """Lines a client may send at once: they are looked through on the control loop, in some 2 ms."""
 LINES_BYTES_MAX: Final = 32_768
 EMERGENCY: Final = "M112"
+_EMERGENCY_LINE: Final = re.compile(
+    r"(?:^|(?<=\r))[ \t]*(?:N\d+[ \t]*)?M112\b", re.ASCII | re.IGNORECASE | re.MULTILINE
+)
+"""Within one line: a search looks at each line once, however many there are."""
 
 
 class WorkError(CanductorError):
@@ -218,6 +223,11 @@ class MoveWork(Work):
         if status is FeedStatus.LIMIT:
             raise WorkError(str(self._planner.fault))
         return End(0, 0.0)
+
+
+def has_emergency(script: str) -> bool:
+    """Return whether SCRIPT has a line with M112, whatever its other lines are."""
+    return EMERGENCY in script.upper() and _EMERGENCY_LINE.search(script) is not None
 
 
 def commands_in(lines: Sequence[str]) -> list[str]:

@@ -13,7 +13,7 @@ from typing import NoReturn
 
 import pytest
 
-from coordinator.ipc.protocol.methods import Caller, Registry, Scope
+from coordinator.ipc.protocol.methods import Caller, Method, Registry, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import IpcSettings
 from coordinator.ipc.server.state import StateTree
@@ -159,6 +159,44 @@ def test_a_line_of_a_client_is_unread_until_it_is_done(tmp_path: Path) -> None:
     run(main())
 
 
+def test_a_line_of_a_client_does_not_wait_for_its_requests(tmp_path: Path) -> None:
+    """Failed before: 64 that ran kept it waiting, and meanwhile it kept everybody from a restart."""
+    path = tmp_path / "api.sock"
+
+    async def wait(_: Caller, __: object) -> None:
+        await asyncio.get_running_loop().create_future()
+
+    async def main() -> None:
+        lane, service, registry = StopLane(), Service(), Registry()
+        for method in motion_methods(service):
+            registry.add(method)
+        registry.add(Method("wait", Scope.WATCH, "Wait for ever.", wait))
+        server = IpcServer(registry, StateTree(), IpcSettings(unix_path=path), stop_lane=lane)
+        await server.start()
+        reader, writer = await asyncio.open_unix_connection(path)
+        calls: list[tuple[str, dict[str, object]]] = [("api.hello", {"version": 1})]
+        calls += [("wait", {})] * (server.limits.running_requests + server.limits.pending_requests)
+        for number, (name, params) in enumerate(calls):
+            writer.write(json.dumps({"id": number, "method": name, "params": params}).encode() + b"\n")
+        await reader.readline()
+        for request_id, ignored in (
+            (len(calls), None),
+            (1, "the id 1 is that of a request without answer yet"),
+        ):
+            line = {"id": request_id, "method": "gcode.run", "params": {"script": "M117 now\nM112"}}
+            writer.write(json.dumps(line).encode() + b"\n")
+            answer = json.loads(await reader.readline())
+            assert answer["id"] == request_id
+            assert answer["result"].get("ignored") == ignored
+            assert service.stops == ["M112 of a client"]
+            assert lane.find() is None
+            service.stops.clear()
+        writer.close()
+        await server.close()
+
+    run(main())
+
+
 def test_a_line_typed_at_the_terminal_stops_the_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,5 +233,26 @@ def test_a_line_typed_at_the_terminal_stops_the_machine(
         typed.close()
 
     with os.fdopen(terminal) as stdin, contextlib.closing(os.fdopen(user, "rb", buffering=0)):
+        monkeypatch.setattr(sys, "stdin", stdin)
+        run(main())
+
+
+def test_a_line_in_the_middle_of_what_a_pipe_brings_stops_the_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A terminal makes line feeds of carriage returns, a pipe does not."""
+    far, near = os.pipe()
+
+    async def main() -> None:
+        said: list[str] = []
+        service = Service()
+        typed = Typed(service, said.append)
+        os.write(near, b"M114\rM112\nM114\n")
+        await asyncio.sleep(0.1)
+        assert service.stops == ["M112 of a client"]
+        assert len(said) == 1
+        typed.close()
+
+    with os.fdopen(far) as stdin, contextlib.closing(os.fdopen(near, "wb", buffering=0)):
         monkeypatch.setattr(sys, "stdin", stdin)
         run(main())
