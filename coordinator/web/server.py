@@ -346,7 +346,9 @@ class WebServer:
         self._ipc.stop_lane.watch_transport(
             connection,
             request.transport,
-            lambda unread: connection.session.find_stop(unrelayed.lines(waiting() + unread)),
+            lambda unread: connection.session.find_stop(
+                unrelayed.lines(waiting() + unread), self._ipc.stop_lane.goes_on
+            ),
         )
         self._clients[connection] = session
         sending = asyncio.ensure_future(transport.run())

@@ -7,7 +7,7 @@ message ends in one ``EndReason``, after which the stream is dead.
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import Enum
 from typing import Any, Final
 
@@ -111,6 +111,26 @@ class WireReader:
     def waiting_bytes(self) -> int:
         """Bytes fed and not yet returned as messages."""
         return len(self._buffer)
+
+    def find(self, words: Iterable[bytes]) -> int:
+        """Return where the first of WORDS is in what waits, as a number of bytes; -1: there is none."""
+        found = map(self._buffer.find, words)
+        return min((at for at in found if at >= 0), default=-1)
+
+    def skip_to(self, at: int) -> None:
+        """Drop the messages that end before byte AT of what waits."""
+        begin = 0
+        if self.encoding is Encoding.JSON:
+            begin = self._buffer.rfind(b"\n", 0, at) + 1
+        while self.encoding is Encoding.MSGPACK and begin + LENGTH.size <= at:
+            end = begin + LENGTH.size + LENGTH.unpack_from(self._buffer, begin)[0]
+            if end > at:
+                break
+            begin = end
+        if begin:
+            del self._buffer[:begin]
+            self._scanned = 0
+            self._begun_s = None
 
     def next_message(self) -> dict[str, Any] | EndReason | None:
         """Return the next message, None until there are more bytes, or why there will be none."""

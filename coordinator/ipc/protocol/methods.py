@@ -110,6 +110,10 @@ A plain function is answered at once, which is the fastest; a coroutine runs as 
 when its caller leaves or cancels the request. Raises CanductorError; ApiError where the code matters."""
 
 
+def _stops_nothing(_caller: Caller, _params: dict[str, Any]) -> str | None:
+    pass
+
+
 @dataclass(frozen=True, slots=True)
 class Method:
     """A method of the interface."""
@@ -124,10 +128,12 @@ class Method:
     urgent: bool = False
     """Called while the message is received, ahead of everything that waits, and whatever is wrong with its
     parameters; must be a plain function, and require none."""
-    stops: Callable[[Caller, dict[str, Any]], str | None] = lambda _caller, _params: None
+    stops: Callable[[Caller, dict[str, Any]], str | None] = _stops_nothing
     """Return whom a call with such parameters names as who stops the machine; None: it does not. In any
     thread: while the control loop is held, such a call is carried out without it (server/stop_lane.py). It is
     called as an urgent one is, and must have stopped the machine when it returns."""
+    stop_words: tuple[str, ...] = ()
+    """One of them is in the text of each call that is urgent or stops; empty: the method's name is."""
 
     def schema(self) -> dict[str, Value]:
         """Return the declaration as "api.methods" shows it."""
@@ -184,12 +190,19 @@ class Registry:
 
     def __init__(self) -> None:
         self.methods: dict[str, Method] = {}
+        self.stop_words: dict[Scope, tuple[bytes, ...]] = dict.fromkeys(Scope, ())
+        """By a client's scope: one of them is in the text of each of its calls that is urgent or stops."""
 
     def add(self, method: Method) -> None:
         """Add METHOD; its name must be new."""
         assert method.name not in self.methods, method.name
         assert not (method.urgent and any(param.required for param in method.params)), method.name
         self.methods[method.name] = method
+        if method.urgent or method.stops is not _stops_nothing:
+            words = tuple(word.encode() for word in method.stop_words or (method.name,))
+            for scope in Scope:
+                if scope >= method.scope:
+                    self.stop_words[scope] += words
 
     def schema(self) -> list[Value]:
         """Return what "api.methods" answers: every method, sorted by name."""

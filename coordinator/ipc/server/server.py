@@ -336,13 +336,13 @@ class IpcServer:
         session = Session(
             self._context, 0.0, number=0, peer=f"uid {uid}, pid {pid}", granted=self._settings.unix_scope
         )
-        return session.find_stop(unread)
+        return session.find_stop(unread, self.stop_lane.goes_on)
 
     def _find_stop_over_tcp(self, address: str, unread: bytes) -> str | None:
         """Return who stops the machine with the UNREAD bytes of a new connection over TCP from ADDRESS."""
         find = functools.partial(self._find_token, address)
         session = Session(self._context, 0.0, number=0, peer=address, granted=None, find_token=find)
-        return session.find_stop(unread)
+        return session.find_stop(unread, self.stop_lane.goes_on)
 
     def _find_token(self, address: str, token: str) -> Grant | None:
         """Return what TOKEN gives to somebody at ADDRESS, in any thread: the loop counts when it reads it."""
@@ -381,7 +381,8 @@ class IpcServer:
             find_token=find_token,
         )
         self._connections.add(connection)
-        self.stop_lane.watch_transport(connection, connection.transport, session.find_stop)
+        find_stop = functools.partial(session.find_stop, goes_on=self.stop_lane.goes_on)
+        self.stop_lane.watch_transport(connection, connection.transport, find_stop)
         if len(self._connections) > self._settings.connections_max:
             self._refuse(session, EndReason("busy", "there are too many connections; close others"))
         if len(self._connections) > self._settings.connections_max + REFUSALS_MAX:

@@ -28,6 +28,8 @@ BYTES_PER_TURN: Final = 65_536
 ID_MAX: Final = 2**53 - 1
 """Every JSON library can carry it exactly."""
 METHOD_LENGTH_MAX: Final = 128
+_ESCAPE: Final = b"\\"
+"""JSON can write each character in another way behind it."""
 PHASES: Final = 8
 """Watchers of one rate are spread over so many groups, or all updates would be due at one instant."""
 
@@ -69,6 +71,10 @@ class SessionContext:
     registry: Registry
     publisher: Publisher
     limits: Limits
+
+
+def _to_the_end() -> bool:
+    return True
 
 
 class Session:
@@ -216,10 +222,11 @@ class Session:
 
     # ------------------------------------------------------------------------------ while the loop is held
 
-    def find_stop(self, unread: bytes) -> str | None:
+    def find_stop(self, unread: bytes, goes_on: Callable[[], bool] = _to_the_end) -> str | None:
         """Return who stops the machine with what waits here and with the UNREAD bytes behind it; else None.
 
-        In any thread; the session stays as it is. A twin of it reads the bytes, so that rights are the same.
+        In any thread; the session stays as it is. A twin of it reads the messages that may be a stop, so that
+        rights are the same; after each turn's worth of them GOES_ON tells whether there is time for more.
         """
         if self.end_reason is not None or not (unread or self._reader.waiting_bytes):
             return None
@@ -227,16 +234,31 @@ class Session:
         twin.check_token = self._find_token
         twin.caller, twin._reader = self.caller, self._reader.copy()
         twin._reader.feed(unread, 0.0)
-        while True:
-            before = twin._reader.waiting_bytes
+        while twin.skip_to_stop():
+            before = twin.unread_bytes
             for request in twin.read(0.0):
                 assert twin.caller is not None
                 if (who := request.method.stops(twin.caller, request.params)) is not None:
                     return who
             twin._waiting.clear()
             twin._ids.clear()
-            if twin.end_reason is not None or twin._reader.waiting_bytes == before:
-                return None
+            if twin.unread_bytes == before or not goes_on():
+                break
+        return None
+
+    def skip_to_stop(self) -> bool:
+        """Drop unread messages before the first one that may stop the machine; return whether there is one.
+
+        They get no answer. Before the hello nothing is dropped.
+        """
+        scope = Scope.ADMIN if self.caller is None else self.caller.scope
+        words = self.context.registry.stop_words[scope]
+        if not words or self.end_reason is not None:
+            return False
+        at = self._reader.find((*words, _ESCAPE))
+        if self.caller is not None and at >= 0:
+            self._reader.skip_to(at)
+        return at >= 0
 
     # --------------------------------------------------------------------------------------- requests
 

@@ -47,7 +47,7 @@ class StopLane:
     """Looks at what is unread; STOP is called with who stops the machine, in the thread that has looked.
 
     A look takes tens of ms when many clients have sent much. It ends when the loop goes on, and the loop
-    waits for one finder at most.
+    waits for one finder at most, which ends early (``goes_on``) where it would take long.
     """
 
     def __init__(self, stop: Callable[[str], None] = _ignore) -> None:
@@ -64,6 +64,8 @@ class StopLane:
         self._accepting: dict[socket.socket, Callable[[], object]] = {}
         self._epoll = select.epoll()
         """Of sockets that listen and of new connections; edge-triggered."""
+        self._goes_on: Callable[[], bool] = _to_the_end
+        """Of who has the lock."""
         self._callbacks: dict[int, Callable[[], object]] = {}
         """By their descriptors."""
         self.events_fd: Final = self._epoll.fileno()
@@ -155,7 +157,7 @@ class StopLane:
     def find(self) -> str | None:
         """Return who stops the machine with what is unread; None: nobody. Stops nothing."""
         failures: list[Exception] = []
-        who = self._find(failures, _to_the_end)
+        who = self._find(failures, _to_the_end, _to_the_end)
         if who is None and failures:
             raise failures[0]
         return who
@@ -199,9 +201,7 @@ class StopLane:
             raise failures[0]
 
     def _look_at_new(self, opened: socket.socket) -> None:
-        with self._turn():
-            find = self._new.get(opened)
-            who = None if find is None else find()
+        who = self._ask(self._new, opened, self._is_alone)
         if who is not None:
             self._stop(who)
 
@@ -218,7 +218,7 @@ class StopLane:
                 accept()
             except Exception as error:  # noqa: BLE001 (as above)
                 failures.append(error)
-        who = self._find(failures, is_held)
+        who = self._find(failures, is_held, lambda: is_held() and self._is_alone())
         if who is not None:
             self._stop(who)
         if failures:
@@ -226,16 +226,33 @@ class StopLane:
 
     # ---- On the loop, or in the lane's thread ----
 
-    def _find(self, failures: list[Exception], goes_on: Callable[[], bool]) -> str | None:
+    def goes_on(self) -> bool:
+        """Return whether the finder that is asked has time: the loop does not wait, or wants to know it."""
+        return self._goes_on()
+
+    def _is_alone(self) -> bool:
+        """Return whether nobody waits for the lock."""
+        return not self._next.locked()
+
+    def _ask(self, table: dict[Any, Finder], key: Any, goes_on: Callable[[], bool]) -> str | None:
+        """Return what the finder of KEY in TABLE finds while it GOES_ON, if there still is one."""
+        with self._turn():
+            self._goes_on = goes_on
+            find = table.get(key)
+            return None if find is None else find()
+
+    def _find(
+        self, failures: list[Exception], is_held: Callable[[], bool], goes_on: Callable[[], bool]
+    ) -> str | None:
+        """Ask all finders while IS_HELD, each as long as it GOES_ON."""
         tables: tuple[dict[Any, Finder], ...] = self._others, self._unread, self._new
         with self._turn():
             watched = [(table, key) for table in tables for key in table]
         for table, key in watched:
-            if not goes_on():
+            if not is_held():
                 return None
             try:
-                with self._turn():
-                    who = table[key]() if key in table else None
+                who = self._ask(table, key, goes_on)
             except Exception as error:  # noqa: BLE001 (as above)
                 failures.append(error)
                 continue

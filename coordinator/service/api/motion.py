@@ -182,6 +182,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         params=(Param("script", Kind.STR, "lines", high=LINES_BYTES_MAX), _WAIT),
         returns=_TOLD,
         stops=_who_stops,
+        stop_words=(EMERGENCY, EMERGENCY.lower()),
     )
     yield Method(
         "gcode.macros",

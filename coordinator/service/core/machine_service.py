@@ -385,8 +385,6 @@ class MachineService:
             raise ApiError(
                 "busy", "an emergency stop that was sent behind it came first; ask again for a restart"
             )
-        if (who := self.find_unread_stop()) is not None:
-            raise ApiError("busy", f"an emergency stop by {who} has just come; ask again when it is done")
         if self.state is ServiceState.STARTUP:
             raise ApiError("busy", "the machine is starting already")
         if self._restart.is_set():
@@ -395,6 +393,8 @@ class MachineService:
             motion = self.ready_motion()
             if motion.feeder.busy or not motion.standing:
                 raise ApiError("busy", self._why_busy(motion))
+        if (who := self.find_unread_stop()) is not None:  # it takes time where clients have sent much
+            raise ApiError("busy", f"an emergency stop by {who} has just come; ask again when it is done")
         self._restart_now(firmware)
 
     def _why_busy(self, motion: Motion) -> str:

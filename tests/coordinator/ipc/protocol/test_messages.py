@@ -44,6 +44,27 @@ def test_messages_come_out_as_they_went_in_however_they_are_cut(
 
 
 @settings(max_examples=examples(30))
+@given(messages, st.sampled_from(Encoding), st.data())
+def test_messages_before_a_byte_are_skipped(
+    sent: list[dict[str, Any]], encoding: Encoding, data: st.DataObject
+) -> None:
+    encoder, reader = Encoder(), WireReader(LIMITS)
+    reader.feed(encoder.message(encoding, {}), 0.0)
+    assert reader.next_message() == {}
+    pieces = [encoder.message(encoding, message) for message in sent]
+    ends = list(itertools.accumulate(map(len, pieces)))
+    cut = data.draw(st.integers(1, ends[-1]))
+    reader.feed(b"".join(pieces)[:cut], 0.0)
+    at = data.draw(st.integers(0, cut - 1))
+    reader.skip_to(at)
+    reader.feed(b"".join(pieces)[cut:], 0.0)
+    left = [message for message, end in zip(sent, ends, strict=True) if end > at]
+    assert [reader.next_message() for _ in left] == left
+    assert reader.next_message() is None
+    assert reader.waiting_bytes == 0
+
+
+@settings(max_examples=examples(30))
 @given(st.dictionaries(st.text(), values, min_size=1, max_size=3), st.sampled_from(Encoding))
 def test_joined_pieces_are_one_message(part: dict[str, Any], encoding: Encoding) -> None:
     encoder, reader = Encoder(), WireReader(LIMITS)

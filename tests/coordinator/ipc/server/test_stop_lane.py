@@ -543,6 +543,33 @@ def test_the_loop_waits_for_one_finder_at_most() -> None:
     assert looked == [0, 1, 2, 3, 4]
 
 
+def test_a_finder_that_takes_long_ends_for_the_loop() -> None:
+    """Failed before: a connection that was closed waited for all messages of another client, 75 ms."""
+    lane, begun, is_held = Lane(), threading.Event(), True
+
+    def find_slowly() -> None:
+        begun.set()
+        until_s = time.monotonic() + PATIENCE_S
+        while lane.goes_on():
+            assert time.monotonic() < until_s
+
+    lane.look_also(find_slowly)
+    thread = threading.Thread(target=lane.look, args=(lambda: is_held,))
+    thread.start()
+    assert begun.wait(PATIENCE_S)
+    lane.forget("a connection")  # as the loop does, which cannot go on before
+    thread.join()
+    begun.clear()
+    thread = threading.Thread(target=lane.look, args=(lambda: is_held,))
+    thread.start()
+    assert begun.wait(PATIENCE_S)
+    is_held = False
+    thread.join()
+    lane.look_also(lambda: str(lane.goes_on()))
+    del lane._others[find_slowly]
+    assert lane.find() == "True", "a restart needs to know it"
+
+
 def test_a_new_connection_that_has_closed_is_no_failure(tmp_path: Path) -> None:
     """As one that is cut off while its protocol is made; failed before."""
     lane = Lane()

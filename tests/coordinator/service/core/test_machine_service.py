@@ -4,9 +4,12 @@ import asyncio
 from collections.abc import Iterator
 from typing import Any, NoReturn, cast
 
+import pytest
+
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.ipc.server.state import StateTree
 from coordinator.runtime.host import Host
-from coordinator.service.core.machine_service import REFRESH_S, MachineService, ServiceSettings
+from coordinator.service.core.machine_service import REFRESH_S, MachineService, ServiceSettings, ServiceState
 from coordinator.service.state.figures import Figures
 from tests.stages.jump_loop import run
 
@@ -25,6 +28,17 @@ class VirtualHost:
 def service_of(tree: StateTree) -> MachineService:
     settings = ServiceSettings(name="test")
     return MachineService(_load, cast("Host", VirtualHost()), tree, settings, on_line=lambda _: None)
+
+
+@pytest.mark.parametrize("state", [ServiceState.STARTUP, ServiceState.READY, ServiceState.SHUTDOWN])
+def test_a_restart_looks_for_unread_stops_only_where_it_is_possible(state: ServiceState) -> None:
+    """Failed before: while a job printed each call looked through all that clients had sent."""
+    service, looks = service_of(StateTree()), list[None]()
+    service.find_unread_stop = lambda: looks.append(None) or "me"  # type: ignore[func-returns-value]
+    service.state = state
+    with pytest.raises(ApiError) as raised:
+        service.restart()
+    assert ("by me has just come" in raised.value.sentence) == bool(looks) == (state is ServiceState.SHUTDOWN)
 
 
 class BrokenFigures:
