@@ -6,6 +6,7 @@ import pytest
 
 from tests.canbus_tools.command import Command
 from tests.stages.can_stage import CanStage, SixNodes, six_nodes
+from tests.stages.own_sockets import own_sockets
 
 
 @pytest.fixture
@@ -24,7 +25,7 @@ def six(stage: CanStage) -> SixNodes:
 def no_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the user's cache of dictionaries, and the machines that the user runs, out of it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
+    own_sockets(monkeypatch, tmp_path / "run")
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from nodes.support.errors import CanductorError
-from nodes.support.host_sockets import host_sockets, socket_folder
+from nodes.support.host_sockets import host_sockets, socket_folders
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +47,15 @@ def read_address(text: str | None) -> Address:
 
 
 def _only_machine() -> Address:
-    folder, found = socket_folder(), host_sockets()
+    found = host_sockets()
     if len(found) > 1:  # a single one is not probed: connecting shows the same, and a stop must not wait
         found = [path for path in found if _is_served(path)] or found[:1]
     if len(found) == 1:
         return Address(path=found[0])
     if not found:
+        folders = ", ".join(map(str, socket_folders()))
         raise CanductorError(
-            f"no machine runs here: there is no socket in {folder}; name one with --at ADDRESS"
+            f"no machine of this user runs here: there is no socket in {folders}; name one with --at ADDRESS"
         )
     raise CanductorError(f"several machines run here; name one with --at: {', '.join(map(str, found))}")
 

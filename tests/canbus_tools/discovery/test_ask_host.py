@@ -11,6 +11,7 @@ from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.discovery import ask_host
 from canbus_tools.discovery.ask_host import ask_hosts
 from canbus_tools.discovery.node_info import NodeInfo
+from tests.stages.own_sockets import own_sockets
 
 NODE = {
     "bus": "can0",
@@ -28,7 +29,7 @@ Ask = Callable[[bytes | None], dict[int, NodeInfo]]
 @pytest.fixture
 def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ask:
     """Ask a program that says what is given after the first line it gets; None: it never says a word."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    own_sockets(monkeypatch, tmp_path)
     (tmp_path / "canductor").mkdir()
 
     def asked(says: bytes | None) -> dict[int, NodeInfo]:

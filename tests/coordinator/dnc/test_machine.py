@@ -22,6 +22,7 @@ from coordinator.support.values import Value
 from tests.coordinator.dnc.virtual_cable import PROGRAM, Ended, VirtualCable
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, serving
 from tests.stages.loop_thread import in_thread
+from tests.stages.own_sockets import own_sockets
 
 
 class Job:
@@ -107,7 +108,7 @@ def token_file(path: Path, token: str) -> str:
 @pytest.mark.parametrize("tcp", [False, True])
 def test_receive_and_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tcp: bool) -> None:
     """Over a Unix socket, and over TCP with a token; when it cannot be started, it is there all the same."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    own_sockets(monkeypatch, tmp_path)
     inbox, outbox = tmp_path / "inbox", tmp_path / "outbox"
     inbox.mkdir()
     outbox.mkdir()

@@ -20,6 +20,7 @@ from coordinator.web.methods import add_page_methods
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, serving
 from tests.stages import jump_loop
 from tests.stages.loop_thread import in_thread
+from tests.stages.own_sockets import own_sockets
 
 if TYPE_CHECKING:
     from coordinator.web.server import WebServer
@@ -31,7 +32,7 @@ CANDUCTOR = (sys.executable, "-m", "coordinator.cli.main")
 @pytest.fixture
 def canductor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
     """Return what carries out a command in this process: its status, and what it printed."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    own_sockets(monkeypatch, tmp_path)
 
     def command(*words: str) -> tuple[int, str, str]:
         capsys.readouterr()
@@ -214,10 +215,9 @@ def test_watch_says_that_nothing_matches_and_goes_on(tmp_path: Path, canductor: 
     with machine(tmp_path) as served:
         served.state.set("a.x", 1)
         with subprocess.Popen(
-            [*CANDUCTOR, "watch", "nothing.*", "b", "--count", "2"],
+            [*CANDUCTOR, "watch", "nothing.*", "b", "--count", "2", "--at", served.at],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
         ) as process:
             assert process.stderr is not None
             told = process.stderr.readline()

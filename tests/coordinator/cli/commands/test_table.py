@@ -7,6 +7,7 @@ import pytest
 
 from coordinator.cli import main as cli
 from coordinator.cli.commands.table import _side
+from tests.stages.own_sockets import own_sockets
 
 TABLE = "0 0 0\n100 100.01 99.99\n"
 MACHINE = Path("config/demo/machine.cfg")
@@ -111,7 +112,7 @@ def test_words_that_do_not_do(
 def test_without_a_machine_send_says_so(
     comp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    own_sockets(monkeypatch, tmp_path)
     status, _, err = ended(capsys, "send", comp, "--axis", "x", "--at", str(tmp_path / "none.sock"))
     assert status == 1
     assert "none.sock" in err

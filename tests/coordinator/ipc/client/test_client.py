@@ -17,6 +17,7 @@ from nodes.support.errors import CanductorError
 from tests.coordinator.certificates import make_certificate
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, registry_of, run, serving
 from tests.stages.loop_thread import in_thread
+from tests.stages.own_sockets import own_sockets
 
 
 @pytest.mark.parametrize("encoding", Encoding)
@@ -157,13 +158,13 @@ def test_the_blocking_face(tmp_path: Path) -> None:
 
 
 def test_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    own_sockets(monkeypatch, tmp_path)
     assert str(read_address("tls://printer.local:7130")) == "tls://printer.local:7130"
     assert read_address("unix:/a/b").path == Path("/a/b")
     for bad in ("http://x:1", "tcp://x", "tcp://:1", "tcp://x:99999", "tcp://[x:1"):
         with pytest.raises(CanductorError, match="is not an address"):
             read_address(bad)
-    with pytest.raises(CanductorError, match="no machine runs here"):
+    with pytest.raises(CanductorError, match="no machine of this user runs here"):
         read_address(None)
 
 

@@ -28,6 +28,7 @@ from tests.coordinator.ipc.served import serving
 from tests.profiles import examples
 from tests.stages import jump_loop
 from tests.stages.own_networks import LOOPBACK_UP, on_own_networks
+from tests.stages.own_sockets import own_sockets
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
@@ -349,7 +350,7 @@ def test_more_announcements_than_anybody_has_are_counted_only() -> None:
 
 
 def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    own_sockets(monkeypatch, tmp_path)
     folder = tmp_path / "canductor"
     folder.mkdir()
     here, other = machine("here", state="ready"), machine("else", tls=True, port=7127)
@@ -386,7 +387,12 @@ def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pyt
 
 # ------------------------------------------------------------------- multicast DNS, on networks of its own
 
-_DISCOVER = "from coordinator.cli.main import main; main(['discover', '--timeout', '0.2'])\n"
+_DISCOVER = """
+from coordinator.cli.main import main
+from nodes.support import host_sockets
+host_sockets.SYSTEM_FOLDERS = ()  # machines of who runs this test
+main(['discover', '--timeout', '0.2'])
+"""
 
 
 def test_a_computer_without_networks() -> None:
