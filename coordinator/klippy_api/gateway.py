@@ -11,9 +11,10 @@ from typing import Any, Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.ipc.protocol.overtaken import doing
+from coordinator.ipc.protocol.peer import may_use, peer_of
 from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.stop_lane import StopLane
-from coordinator.ipc.server.unix_socket import UnixListener, may_use, peer_of
+from coordinator.ipc.server.unix_socket import UnixListener
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
 from coordinator.klippy_api.subscription import Status, Subscription

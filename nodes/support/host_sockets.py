@@ -22,6 +22,27 @@ def socket_folders() -> list[Path]:
     return list(dict.fromkeys((socket_folder(), *map(_of_user, SYSTEM_FOLDERS))))
 
 
+def folder_problem(folder: Path) -> str | None:
+    """Return why no socket in FOLDER may be used; None: each may be, or there is no such folder.
+
+    Where others can write, somebody may have put a socket there that answers in a machine's place.
+    """
+    try:
+        status = folder.lstat()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        return f"{folder} cannot be looked at: {(error.strerror or str(error)).lower()}"
+    if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022:
+        return None
+    return f"{folder} must be a folder of this user's, no link, that nobody else may write to"
+
+
+def folder_problems() -> list[str]:
+    """Return why folders are not looked into."""
+    return [problem for folder in socket_folders() if (problem := folder_problem(folder)) is not None]
+
+
 def host_sockets() -> list[Path]:
     """Return the paths of the sockets of this user's machines; their processes may have ended."""
     found: dict[tuple[int, int], Path] = {}
@@ -37,9 +58,11 @@ def _of_user(folder: str) -> Path:
 
 
 def _paths(folder: Path) -> list[Path]:
+    if folder_problem(folder) is not None:
+        return []
     try:
         return [path for path in folder.iterdir() if path.suffix == ".sock"]
-    except OSError:  # there is none, or it is another user's
+    except OSError:  # there is none
         return []
 
 

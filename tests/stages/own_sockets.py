@@ -6,6 +6,7 @@ import pytest
 
 
 def own_sockets(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    """Let machines be looked for in FOLDER/canductor alone."""
+    """Let machines be looked for in FOLDER/canductor alone, and make it as a service does."""
+    (folder / "canductor").mkdir(mode=0o700, parents=True, exist_ok=True)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
     monkeypatch.setattr("nodes.support.host_sockets.SYSTEM_FOLDERS", ())

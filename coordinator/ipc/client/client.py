@@ -13,6 +13,7 @@ from coordinator.ipc.protocol.address import read_address
 from coordinator.ipc.protocol.limits import EndReason, Limits
 from coordinator.ipc.protocol.messages import LENGTH_MAX, Encoder, Encoding, WireReader
 from coordinator.ipc.protocol.methods import ApiError, Scope
+from coordinator.ipc.protocol.peer import may_serve, peer_of
 from coordinator.ipc.server.session_methods import API_VERSION
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
@@ -226,6 +227,8 @@ class Client:
                 )
         except OSError as error:
             raise ConnectionLost(connect_error_sentence(address, error)) from None
+        if address.path is not None:
+            self._check_server(self._writer)
         self._wire = WireReader(LIMITS, checked=False)
         hello = asyncio.create_task(self._ask("api.hello", self._hello_params))
         if self._first is not None:
@@ -240,6 +243,15 @@ class Client:
             hello.cancel()
         self.hello = Hello(answer["version"], answer["session"], Scope[answer["scope"].upper()])
         self._connected.set()
+
+    def _check_server(self, writer: asyncio.StreamWriter) -> None:
+        """Raise ConnectionLost when a stranger has taken the place of the machine at the Unix socket."""
+        _, uid = peer_of(writer.get_extra_info("socket"))
+        if not may_serve(uid):
+            raise ConnectionLost(
+                f"{self.address} is served by the user with uid {uid}, neither by this user nor by root;"
+                " nothing was sent"
+            )
 
     async def _keep(self) -> None:
         """Read while there is a connection, and reconnect when it is lost."""

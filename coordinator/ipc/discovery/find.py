@@ -14,7 +14,7 @@ from coordinator.ipc.discovery.browser import Browser, OpenServices
 from coordinator.ipc.discovery.multicast import interface_addresses
 from coordinator.ipc.protocol.methods import Scope
 from nodes.support.errors import CanductorError
-from nodes.support.host_sockets import host_sockets
+from nodes.support.host_sockets import folder_problems, host_sockets
 from nodes.support.terminal import printable
 
 SOCKETS_MAX: Final = 64
@@ -50,6 +50,8 @@ class Discovered:
     machines: Sequence[Found]
     silent: Sequence[Path]
     """Sockets at which no machine answered."""
+    refused: Sequence[str]
+    """Why folders for sockets were not looked into."""
     skipped: int
     """Announcements without a reachable machine."""
     problem: str | None
@@ -65,6 +67,7 @@ class Discovered:
         return {
             "machines": [machine.to_json() for machine in self.machines],
             "silent_sockets": [str(path) for path in self.silent],
+            "refused_folders": list(self.refused),
             "skipped": self.skipped,
             "problem": self.problem,
         }
@@ -74,6 +77,7 @@ class Discovered:
         lines = _table(self.machines) if self.machines else ["no machine was found"]
         if self.silent:
             lines.append(f"no machine answers at {', '.join(map(str, self.silent))}")
+        lines += self.refused
         if self.skipped:
             lines.append(f"invalid announcements: {self.skipped}")
         if self.problem is not None:
@@ -105,7 +109,7 @@ async def find_machines(timeout_s: float, listen: OpenServices | None = None) ->
     for machine in announced:
         _add(found, machine, own)
     found.sort(key=lambda machine: (not machine.here, machine.name, machine.host, machine.at))
-    return Discovered(found, silent, skipped, problem)
+    return Discovered(found, silent, folder_problems(), skipped, problem)
 
 
 def _add(found: list[Found], announced: Announcement, own: set[str]) -> None:

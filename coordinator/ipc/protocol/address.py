@@ -6,7 +6,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from nodes.support.errors import CanductorError
-from nodes.support.host_sockets import host_sockets, socket_folders
+from nodes.support.host_sockets import folder_problems, host_sockets, socket_folders
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +54,8 @@ def _only_machine() -> Address:
         return Address(path=found[0])
     if not found:
         folders = ", ".join(map(str, socket_folders()))
-        raise CanductorError(
-            f"no machine of this user runs here: there is no socket in {folders}; name one with --at ADDRESS"
-        )
+        reasons = [f"no machine of this user runs here: there is no socket in {folders}", *folder_problems()]
+        raise CanductorError(f"{'; '.join(reasons)}; name one with --at ADDRESS")
     raise CanductorError(f"several machines run here; name one with --at: {', '.join(map(str, found))}")
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from coordinator.ipc.protocol.limits import EndReason, Limits
 from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.protocol.methods import ApiError, Caller, Method, Registry
+from coordinator.ipc.protocol.peer import may_use, peer_of
 from coordinator.ipc.server.auth import Grant, LoginThrottle, Tokens, digest_of, stamp_of
 from coordinator.ipc.server.connection import Connection
 from coordinator.ipc.server.fair_scheduler import FairScheduler
@@ -22,7 +23,7 @@ from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.stop_lane import StopLane
 from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, TcpListener
-from coordinator.ipc.server.unix_socket import UnixListener, may_use, peer_of
+from coordinator.ipc.server.unix_socket import UnixListener
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 

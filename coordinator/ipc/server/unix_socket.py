@@ -5,17 +5,13 @@ import contextlib
 import functools
 import os
 import socket
-import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
 
 from coordinator.ipc.server.acceptor import Acceptor, Arrival
 from coordinator.ipc.server.stop_lane import StopLane, find_unread
 from nodes.support.errors import CanductorError
-
-_PEER: Final = struct.Struct("3i")
-"""Of SO_PEERCRED: pid, uid, gid."""
+from nodes.support.host_sockets import folder_problem, socket_folders
 
 
 class UnixListener:
@@ -85,21 +81,12 @@ def _bound_to(path: Path) -> socket.socket:
     return listener
 
 
-def peer_of(opened: socket.socket) -> tuple[int, int]:
-    """Return pid and uid of the process at the other end."""
-    pid, uid, _ = _PEER.unpack(opened.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
-    return pid, uid
-
-
-def may_use(uid: int) -> bool:
-    """Return whether the user UID may use this user's sockets."""
-    return uid in (0, os.geteuid())
-
-
 def _make_way(path: Path) -> None:
     """Make the folder of PATH, and remove a socket that a dead coordinator left there."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if path.parent in socket_folders() and (problem := folder_problem(path.parent)) is not None:
+            raise CanductorError(f"the socket {path} cannot be opened: {problem}; choose another path")
         if not path.is_socket():
             if path.exists():
                 raise CanductorError(f"{path} exists and is not a socket; choose another path or remove it")

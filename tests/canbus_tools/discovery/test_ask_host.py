@@ -30,7 +30,6 @@ Ask = Callable[[bytes | None], dict[int, NodeInfo]]
 def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ask:
     """Ask a program that says what is given after the first line it gets; None: it never says a word."""
     own_sockets(monkeypatch, tmp_path)
-    (tmp_path / "canductor").mkdir()
 
     def asked(says: bytes | None) -> dict[int, NodeInfo]:
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

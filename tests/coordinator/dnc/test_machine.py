@@ -70,7 +70,7 @@ class AtWork:
 @contextlib.contextmanager
 def machine(folder: Path, **settings: Any) -> Iterator[AtWork]:
     """Serve, on a thread of its own, an interface with a job folder, and a job that is fed."""
-    (folder / "canductor").mkdir()
+    (folder / "canductor").mkdir(mode=0o700, exist_ok=True)
     (folder / "jobs").mkdir()
 
     @contextlib.asynccontextmanager

@@ -23,6 +23,7 @@ from tests.coordinator.ipc.served import (
     run,
     tokens_file,
 )
+from tests.stages.own_sockets import own_sockets
 
 
 def test_the_socket_is_its_owners_alone(tmp_path: Path) -> None:
@@ -55,6 +56,28 @@ def test_a_dead_socket_is_replaced_a_live_one_and_a_file_are_not(tmp_path: Path)
             await fourth.start()
         assert dead.read_text() == "precious"
 
+    run(tmp_path, body)
+
+
+def test_no_socket_goes_where_others_can_write_and_commands_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a folder of /tmp that another user was the first to make."""
+    own_sockets(monkeypatch, tmp_path)
+    (folder := tmp_path / "canductor").chmod(0o777)
+    problem = "must be a folder of this user's, no link, that nobody else may write to; choose another path"
+
+    async def body(served: Served) -> None:  # elsewhere it is for who starts it to know
+        again = IpcServer(registry_of(served), served.state, IpcSettings(unix_path=folder / "m.sock"))
+        with pytest.raises(CanductorError) as refused:
+            await again.start()
+        assert str(refused.value) == f"the socket {folder}/m.sock cannot be opened: {folder} {problem}"
+        assert not list(folder.iterdir())
+        folder.chmod(0o700)
+        await again.start()
+        await again.close()
+
+    tmp_path.chmod(0o770)
     run(tmp_path, body)
 
 

@@ -6,7 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from nodes.support.host_sockets import SYSTEM_FOLDERS, host_sockets, socket_folder, socket_folders
+from nodes.support.host_sockets import (
+    SYSTEM_FOLDERS,
+    folder_problem,
+    folder_problems,
+    host_sockets,
+    socket_folder,
+    socket_folders,
+)
 from tests.stages.own_sockets import own_sockets
 
 UNIT = Path(__file__).parents[3] / "docs" / "examples" / "systemd" / "canductor.service"
@@ -18,8 +25,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the folder that the environment names; the working folder is its parent."""
     own_sockets(monkeypatch, tmp_path / "run")
     monkeypatch.chdir(tmp_path)  # the path of a socket has 107 bytes
-    (made := tmp_path / "run" / "canductor").mkdir(parents=True, mode=0o700)
-    return made
+    return tmp_path / "run" / "canductor"
 
 
 def leave_socket(path: str) -> Path:
@@ -75,6 +81,26 @@ def test_what_is_no_socket_is_none(folder: Path) -> None:
     assert host_sockets() == []
 
 
+@pytest.mark.parametrize("spoiled", ["owner", "group", "others", "link"])
+def test_a_folder_that_others_may_have_made_is_not_used(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoiled: str
+) -> None:
+    """In /tmp anybody may be first: a socket of his answered a stop with a lie, and got what was sent."""
+    leave_socket("run/canductor/mine.sock")
+    assert folder_problem(folder) is None
+    if spoiled == "owner":
+        owner = os.geteuid()
+        monkeypatch.setattr("os.geteuid", lambda: owner + 1)
+    elif spoiled == "link":
+        folder = folder.rename(tmp_path / "elsewhere")
+        (tmp_path / "run" / "canductor").symlink_to(folder)
+    else:
+        folder.chmod(0o720 if spoiled == "group" else 0o702)
+    assert host_sockets() == []
+    must = "must be a folder of this user's, no link, that nobody else may write to"
+    assert folder_problems() == [f"{tmp_path}/run/canductor {must}"]
+
+
 @pytest.mark.parametrize("name", ["x" * 256, "file", "loop"])
 def test_a_folder_that_cannot_be_looked_at_hides_no_other(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
@@ -86,6 +112,8 @@ def test_a_folder_that_cannot_be_looked_at_hides_no_other(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / name))
     monkeypatch.setattr(LOOKED_INTO, (str(folder),))
     assert host_sockets() == [folder / "mine.sock"]
+    (problem,) = folder_problems()
+    assert problem.startswith(f"{tmp_path / name / 'canductor'} cannot be looked at: ")
 
 
 def test_a_full_disk_hides_no_machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,6 @@ def canductor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 @contextlib.contextmanager
 def machine(folder: Path, **settings: Any) -> Iterator[Served]:
     """Serve a machine to commands, on a thread of its own."""
-    (folder / "canductor").mkdir(exist_ok=True)
     jobs = folder / "jobs"
     jobs.mkdir()
 
@@ -150,7 +149,6 @@ def test_sockets_that_were_left_behind_stop_nobody(tmp_path: Path, canductor: Co
 
 def test_where_nobody_answers(tmp_path: Path, canductor: Command) -> None:
     folder = tmp_path / "canductor"
-    folder.mkdir()
     for name in ("old", "a"):
         leave_socket(folder / f"{name}.sock")
     _, _, err = canductor("status")  # two, and both are dead

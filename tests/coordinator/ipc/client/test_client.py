@@ -1,4 +1,5 @@
 import asyncio
+import os
 import ssl
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from coordinator.ipc.client.connect_errors import connect_error_sentence
 from coordinator.ipc.protocol.address import read_address
 from coordinator.ipc.protocol.messages import Encoding
 from coordinator.ipc.protocol.methods import ApiError, Scope
+from coordinator.ipc.protocol.peer import peer_of
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import TcpSettings
 from nodes.support.errors import CanductorError
@@ -185,6 +187,33 @@ def test_tls(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
         assert b"result" not in await reader.read()
 
     run(tmp_path, body, tcp=tcp)
+
+
+@pytest.mark.parametrize("at", ["named", "found"])
+def test_a_stranger_in_the_machines_place_gets_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
+    """He answered a stop with a lie, and got what was sent."""
+    own_sockets(monkeypatch, tmp_path)
+
+    async def body(served: Served) -> None:
+        opened = (await served.dial())[1].get_extra_info("socket")
+        assert peer_of(opened) == (os.getpid(), os.geteuid())
+        address = read_address(served.at if at == "named" else None)
+        with monkeypatch.context() as patched:
+            patched.setattr("os.geteuid", lambda: 1000)
+            patched.setattr("coordinator.ipc.client.client.peer_of", lambda _: (7, 1001))
+            with pytest.raises(ConnectionLost) as refused:
+                await Client(str(address), first="machine.emergency_stop").__aenter__()
+        assert str(refused.value) == (
+            f"{served.at} is served by the user with uid 1001, neither by this user nor by root;"
+            " nothing was sent"
+        )
+        async with Client(served.at) as client:  # whatever had come before would have been carried out
+            await client.call("machine.info")
+        assert served.order == ["info"]
+
+    run(tmp_path / "canductor", body)
 
 
 async def refusal(at: str, token: str | None = None, trusted: Path | None = None) -> str:

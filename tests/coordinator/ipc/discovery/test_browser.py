@@ -352,7 +352,9 @@ def test_more_announcements_than_anybody_has_are_counted_only() -> None:
 def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own_sockets(monkeypatch, tmp_path)
     folder = tmp_path / "canductor"
-    folder.mkdir()
+    (shared := tmp_path / "shared").mkdir()
+    shared.chmod(0o777)
+    monkeypatch.setattr("nodes.support.host_sockets.SYSTEM_FOLDERS", (str(shared),))
     here, other = machine("here", state="ready"), machine("else", tls=True, port=7127)
 
     async def main() -> None:
@@ -373,6 +375,8 @@ def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pyt
             Found("else", "startup", "here", "0.1.0", 1, other.at, here=False, id=other.id),
         ]
         assert found.silent == [folder / "left-behind.sock"]
+        must = "must be a folder of this user's, no link, that nobody else may write to"
+        assert list(found.refused) == [f"{shared} {must}"]
         text = [line.split() for line in found.to_text().splitlines()]
         assert text == [
             ["name", "state", "computer", "version", "api", "--at"],
@@ -380,6 +384,7 @@ def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pyt
             [here.at[0]],
             ["else", "startup", "here", "0.1.0", "1", other.at[0]],
             ["no", "machine", "answers", "at", str(folder / "left-behind.sock")],
+            [str(shared), *must.split()],
         ]
 
     jump_loop.run(main())
