@@ -23,7 +23,7 @@ from coordinator.web.access import LINK_S, SESSION_S, PageAccess, PageSession, i
 from coordinator.web.files import PageFile, page_files
 from coordinator.web.http_server import HttpServer
 from coordinator.web.names import is_known_host, is_own_origin
-from coordinator.web.session_file import read_sessions, write_sessions
+from coordinator.web.session_file import read_sessions, remove_sessions, write_sessions
 from coordinator.web.settings import WebSettings
 from coordinator.web.stop_request import BODY_BYTES_MAX, STOP_PATH, parse_request, read_body
 from coordinator.web.websocket_frames import FRAMES_PER_S, FrameIntake, UnrelayedMessages
@@ -147,12 +147,19 @@ class WebServer:
         return f"{self.url}#{self._access.new_link(scope, asyncio.get_running_loop().time())}"
 
     async def sign_all_out(self) -> int:
-        """End all sessions with their connections, and all links; return how many sessions there were."""
+        """End all sessions with their connections, and all links; return how many sessions there were.
+
+        Raises CanductorError when the next start would find the sessions again.
+        """
         count = self._access.sign_all_out()
         for connection in list(self._clients):
             connection.session.end(EndReason("bad_token", "all browsers were signed out"))
             connection.flush()
-        await self._save_sessions()
+        if self._settings.sessions is not None:
+            async with self._saving:
+                await asyncio.to_thread(remove_sessions, self._settings.sessions)
+            if self._access.sessions:  # a browser has signed in meanwhile
+                await self._save_sessions()
         return count
 
     async def _read_sessions(self) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.ipc.protocol.methods import Scope
-from coordinator.support.atomic_file import atomic_write
+from coordinator.support.atomic_file import atomic_write, sync_folder
 from coordinator.web.access import SESSIONS_MAX, PageSession
 from nodes.support.errors import CanductorError
 from nodes.support.plain_json import read_json
@@ -50,6 +50,22 @@ def write_sessions(path: Path, sessions: list[PageSession]) -> None:
     except OSError as error:
         raise CanductorError(
             f"the page's sessions cannot be kept in {path}: {error.strerror or error}"
+        ) from None
+
+
+def remove_sessions(path: Path) -> None:
+    """Remove the file PATH, if there is one: a disk without space allows that. Raises CanductorError."""
+    try:
+        path.lstat()  # a read-only disk does not even let what is not there be removed
+        path.unlink()
+        sync_folder(path.parent)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise CanductorError(
+            f"all browsers are signed out, but only until the next start: {path} cannot be removed: {reason};"
+            " remove it before"
         ) from None
 
 

@@ -1,6 +1,7 @@
 """Who gets into the page, how, and who does not."""
 
 import asyncio
+import errno
 import json
 import os
 import socket
@@ -20,6 +21,7 @@ from coordinator.web.access import LINK_S
 from coordinator.web.methods import add_page_methods
 from coordinator.web.names import is_known_host, is_own_origin
 from coordinator.web.server import LOGIN_BYTES_MAX
+from coordinator.web.session_file import read_sessions, remove_sessions
 from coordinator.web.settings import WebSettings
 from tests.coordinator.ipc.served import TOKENS, tokens_file
 from tests.coordinator.web.paged import LOOPBACK, Paged, ask, code_of, paging
@@ -335,6 +337,71 @@ def test_a_disk_that_takes_nothing_keeps_nobody_out(tmp_path: Path) -> None:
             assert "result" in await paged.hello(page)
 
     run(tmp_path, go, replace(LOOPBACK, sessions=tmp_path / "file" / "page.json"))
+
+
+def test_signing_out_needs_no_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It reported success, and the sessions were there again after the next start."""
+    path = tmp_path / "page.json"
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in()
+        assert len(read_sessions(path)) == 1
+        monkeypatch.setattr("coordinator.web.session_file.atomic_write", full_disk)
+        assert await paged.page.sign_all_out() == 1
+        assert paged.served.notices.empty()
+        assert read_sessions(path) == []
+        assert await paged.page.sign_all_out() == 0
+
+    run(tmp_path, go, replace(LOOPBACK, sessions=path))
+
+
+def full_disk(*_: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def read_only_disk(*_: object) -> None:
+    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+
+def test_who_signs_out_hears_that_the_disk_keeps_the_sessions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "page.json"
+
+    async def go(paged: Paged) -> None:
+        add_page_methods(paged.served.server._context.registry, paged.page)
+        owner = await paged.served.script()
+        with monkeypatch.context() as disk:
+            disk.setattr("pathlib.Path.unlink", read_only_disk)
+            assert (await owner.ask("page.sign_out"))["result"] == {"sessions": 0}, "no file was there"
+        await paged.sign_in()
+        with monkeypatch.context() as disk:
+            disk.setattr("pathlib.Path.unlink", read_only_disk)
+            error = (await owner.ask("page.sign_out"))["error"]
+        assert error["message"] == (
+            f"all browsers are signed out, but only until the next start: {path} cannot be removed:"
+            " read-only file system; remove it before"
+        )
+        assert await paged.session_status() == 401
+
+    run(tmp_path, go, replace(LOOPBACK, sessions=path))
+
+
+def test_who_signs_in_while_all_are_signed_out_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "page.json"
+
+    async def go(paged: Paged) -> None:
+        await paged.sign_in()
+
+        def meanwhile(removed: Path) -> None:
+            paged.page._access.sign_in("127.0.0.1", Scope.WATCH, None, 0.0)
+            remove_sessions(removed)
+
+        monkeypatch.setattr("coordinator.web.server.remove_sessions", meanwhile)
+        assert await paged.page.sign_all_out() == 1
+        assert len(read_sessions(path)) == 1
+
+    run(tmp_path, go, replace(LOOPBACK, sessions=path))
 
 
 def test_the_owner_makes_links_and_signs_all_out(tmp_path: Path) -> None:
