@@ -8,6 +8,7 @@ from pathlib import Path
 
 from coordinator.assembly.load import load_machine
 from coordinator.demo.report import DemoReport, report_of
+from coordinator.front_ends.outputs import is_behind, outputs_in_threads
 from coordinator.gcode.program import Program
 from coordinator.runtime.host import Computer
 from coordinator.runtime.linux_host import LinuxHost
@@ -45,7 +46,10 @@ def run_demo(options: DemoOptions) -> DemoReport:
         folder = stack.enter_context(_folder(options.keep))
         program = stack.enter_context(Program.open(options.gcode))
         stage = stack.enter_context(VirtualMachine(description, options, folder))
-        display = stack.enter_context(ProgressDisplay(f"printing {program.name}", quiet=options.json))
+        stack.enter_context(outputs_in_threads())
+        display = stack.enter_context(
+            ProgressDisplay(f"printing {program.name}", quiet=options.json, is_behind=is_behind)
+        )
         return print_and_prove(stage, program, LinuxHost(), display.update)
 
 

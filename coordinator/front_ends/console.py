@@ -1,10 +1,10 @@
-"""What a service says on standard output and standard error: the loop does not wait until it is read."""
+"""Standard output and standard error while a machine moves: the loop does not wait until they are read."""
 
 import logging
 import os
 import select
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -25,13 +25,27 @@ class Console:
         self._fd = -1 if stream is None else stream.fileno()
         self._encoding = "utf-8" if stream is None else stream.encoding
         self._thread = WritingThread("console", self._write, "nobody read them")
+        self.failure: OSError | None = None
+        """Why something could not be written, the first time."""
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether something waits until what came before it is read."""
+        return self._thread.is_behind
 
     def show(self, text: str) -> None:
         """Write the lines of TEXT."""
         self._thread.add(lambda: text)
 
-    def close(self, wait_s: float = END_S) -> None:
-        """Wait until all is written, for WAIT_S at most; then nothing waits for this output any more."""
+    def show_as_it_is(self, text: str) -> None:
+        """Write TEXT, with what moves the cursor of a terminal in it."""
+        self._thread.add_as_it_is(text)
+
+    def close(self, wait_s: float | None = END_S) -> None:
+        """Wait until all is written, for WAIT_S at most (None: as long as it takes).
+
+        Then nothing waits for this output any more.
+        """
         if not self._thread.close(wait_s):
             with Path(os.devnull).open("wb") as nothing:
                 os.dup2(nothing.fileno(), self._fd)
@@ -39,12 +53,14 @@ class Console:
     def _write(self, text: str) -> None:
         # Not by the stream: the interpreter waits for its lock at the end.
         data = text.encode(self._encoding, errors="replace")
-        with suppress(OSError):  # it is closed
+        try:
             while data and self._fd >= 0:
                 try:
                     data = data[os.write(self._fd, data) :]
                 except BlockingIOError:  # another program may have it so that writing does not wait
                     select.select([], [self._fd], [])
+        except OSError as error:  # it is closed, or the disk is full
+            self.failure = self.failure or error
 
 
 class _Reports(logging.Handler):

@@ -3,7 +3,7 @@
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
@@ -14,7 +14,7 @@ WAITING_MAX: Final = 2_000
 LINE_CHARS_MAX: Final = 8_000
 
 Text = Callable[[], str]
-"""Returns lines; called in the thread."""
+"""Returns what to write; called in the thread."""
 
 
 class WritingThread:
@@ -31,8 +31,20 @@ class WritingThread:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
+    @property
+    def is_behind(self) -> bool:
+        """Whether something waits to be written."""
+        return not self._waiting.empty()
+
     def add(self, text: Text) -> None:
         """Have the lines written that TEXT returns; without effect when too many wait."""
+        self._put(lambda: _lines(text()))
+
+    def add_as_it_is(self, text: str) -> None:
+        """Have TEXT written, in which nothing is replaced; without effect when too much waits."""
+        self._put(lambda: text)
+
+    def _put(self, text: Text) -> None:
         try:
             self._waiting.put_nowait(text)
         except queue.Full:
@@ -54,12 +66,12 @@ class WritingThread:
                 while len(texts) < WAITING_MAX:
                     texts.append(self._waiting.get_nowait())
             ended = None in texts
-            lines = [line for text in texts if text is not None for line in text().split("\n")]
+            written = [text() for text in texts if text is not None]
             if left_out := self._left_out:
                 self._left_out -= left_out
-                lines.append(f"{left_out} entries were left out here: {self._why}")
-            self._write(_joined(lines))
+                written.append(_lines(f"{left_out} entries were left out here: {self._why}"))
+            self._write("".join(written))
 
 
-def _joined(lines: Sequence[str]) -> str:
-    return "".join(f"{printable_lines(line)[:LINE_CHARS_MAX]}\n" for line in lines)
+def _lines(text: str) -> str:
+    return "".join(f"{printable_lines(line)[:LINE_CHARS_MAX]}\n" for line in text.split("\n"))

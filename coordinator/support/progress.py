@@ -3,6 +3,7 @@
 Whoever runs the job calls ``update`` as often as is handy; drawing is limited here. No thread, no timer.
 """
 
+import functools
 import sys
 import time
 from collections.abc import Callable
@@ -82,7 +83,8 @@ class ProgressDisplay:
     """Context manager that draws the progress given to ``update``.
 
     On a terminal: a live table on stdout, redrawn at most five times a second, left standing at the end.
-    With quiet (for --json) or without a terminal: one line on stderr at most every five seconds.
+    With quiet (for --json) or without a terminal: one line on stderr at most every five seconds. IS_BEHIND
+    returns whether nobody reads what was drawn: then nothing is drawn.
     """
 
     def __init__(
@@ -93,12 +95,15 @@ class ProgressDisplay:
         stdout: TextIO | None = None,
         stderr: TextIO | None = None,
         clock_s: Callable[[], float] = time.monotonic,
+        is_behind: Callable[[TextIO], bool] = lambda _: False,
     ) -> None:
         self._title = printable(title)
         self._stdout = stdout or sys.stdout
         self._stderr = stderr or sys.stderr
         self._clock_s = clock_s
         self._is_live = not quiet and self._stdout.isatty()
+        stream = self._stdout if self._is_live else self._stderr
+        self._is_behind = functools.partial(is_behind, stream)
         self._interval_s = LIVE_INTERVAL_S if self._is_live else PLAIN_INTERVAL_S
         # A plain line is for jobs that take long; a live picture shall stand at once.
         self._next_s = clock_s() + (0.0 if self._is_live else PLAIN_INTERVAL_S)
@@ -130,7 +135,7 @@ class ProgressDisplay:
         """Take a new state; draws it when the last drawing is old enough."""
         self._last = progress
         now_s = self._clock_s()
-        if now_s < self._next_s:
+        if now_s < self._next_s or self._is_behind():
             return
         self._next_s = now_s + self._interval_s
         if self._live is not None:

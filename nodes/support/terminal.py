@@ -8,7 +8,7 @@ character is replaced, by the same functions, on all ways out.
 import contextlib
 import os
 import sys
-from typing import Final, TextIO
+from typing import Final, Self, TextIO
 
 _STANDARD_FILES: Final = (0, 1, 2)
 _KEPT: Final = "\n\t"
@@ -17,6 +17,11 @@ REPLACEMENT: Final = "?"
 
 class OutputError(OSError):
     """Standard output takes nothing, such as a file on a full disk; a sentence."""
+
+    @classmethod
+    def of(cls, error: OSError) -> Self:
+        """Make it of what was raised by the system."""
+        return cls(f"cannot write the output: {(error.strerror or str(error)).lower()}")
 
 
 def printable(text: str) -> str:
@@ -50,7 +55,7 @@ def show(text: str, stream: TextIO | None = None, *, before: str = "", end: str 
         raise
     except OSError as error:
         discard(stream)
-        raise OutputError(f"cannot write the output: {(error.strerror or str(error)).lower()}") from None
+        raise OutputError.of(error) from None
 
 
 def show_error(text: str, stream: TextIO | None = None) -> None:

@@ -35,7 +35,7 @@ LIGHT, SCALE = section("light", "0102030405aa", "optional"), section("scale", "0
 
 
 def test_nodes_without_power_for_a_while_in_mid_print(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     machine = DemoMachine(tmp_path, sections=LIGHT + SCALE)
     for name, back_s in (("light", 3.0), ("scale", 5.0)):
@@ -45,7 +45,7 @@ def test_nodes_without_power_for_a_while_in_mid_print(
     assert report.ok
     assert report.outcome.positions["stepper_x"] != 0
     assert {node.name for node in report.outcome.nodes} == {*NODES, "light", "scale"}, "READY at the end"
-    lines = capsys.readouterr().out.splitlines()
+    lines = capfd.readouterr().out.splitlines()
     for name, policy in (
         ("light", "its features are off until it is back"),
         ("scale", "the job pauses until the node is back"),
@@ -91,7 +91,7 @@ def test_a_job_that_is_held_reads_no_further_until_it_is_released(tmp_path: Path
 
 
 def test_a_machine_starts_without_an_optional_node_and_knows_the_dictionaries_the_next_time(
-    tmp_path: Path, own_cache: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, own_cache: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     machine = DemoMachine(tmp_path, sections=LIGHT)
     machine.node("light").power_off()
@@ -99,7 +99,7 @@ def test_a_machine_starts_without_an_optional_node_and_knows_the_dictionaries_th
     kept: list[dict[Path, int]] = []
     for config, is_known in ((machine.config, False), (alone, True)):
         report = machine.print("G28\nG1 X5 F3000\n", config)
-        assert ("node 0102030405aa not found" in capsys.readouterr().out) == (not is_known)
+        assert ("node 0102030405aa not found" in capfd.readouterr().out) == (not is_known)
         assert {node.name for node in report.outcome.nodes} == set(NODES)
         kept.append({path: path.stat().st_ino for path in own_cache.glob("*.dict")})
         assert all(path.stat().st_mtime_ns > 0 for path in kept[-1])  # written, or known again

@@ -11,6 +11,7 @@ from typing import Any
 from coordinator.assembly.load import load_machine
 from coordinator.cli.arguments.serving import declare_serving, is_asked_to_serve, serving_options
 from coordinator.config.model import MachineDescription
+from coordinator.front_ends.outputs import is_behind, outputs_in_threads
 from coordinator.front_ends.serve import serve_machine
 from coordinator.gcode.program import Program
 from coordinator.runtime.host import Computer
@@ -130,7 +131,8 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
     """Run OPTIONS.gcode, or standard input as it comes, on the machine of OPTIONS.config and HOST.
 
     HOST: this computer if None. Replies and notices go to standard output as they come. Raises
-    CanductorError, KeyboardInterrupt.
+    CanductorError, KeyboardInterrupt; BrokenPipeError, OutputError when all is done, if the output takes
+    nothing.
     """
     host = host or LinuxHost()
     description = load_machine(str(options.config))
@@ -139,15 +141,16 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
             Program.typed() if options.gcode is None else Program.open(options.gcode)
         )
         _announce(description)
-        show = stack.enter_context(_progress(options, program))
+        stack.enter_context(outputs_in_threads())
+        on_progress = stack.enter_context(_progress(options, program))
         shorten_time_slice()
         lock_memory()
         outcome = run_to_end(
             lambda: run_job(
                 description,
                 program,
-                show,
-                on_output=lambda output: _say(output.text),
+                on_progress,
+                on_output=lambda output: show(output.text),
                 cache=DictionaryCache.of_user(),
                 tables=table_folder(machine_name(options.config)),
                 host=host,
@@ -159,7 +162,7 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
 
 def _announce(description: MachineDescription) -> None:
     for line in (*description.unsupported, *description.notes):
-        _say(str(line))
+        show(str(line))
 
 
 @contextmanager
@@ -168,9 +171,6 @@ def _progress(options: RunOptions, program: Program) -> Iterator[Callable[[Progr
     if options.gcode is None:
         yield lambda _: None
         return
-    with ProgressDisplay(f"printing {program.name}", quiet=options.json) as display:
+    title = f"printing {program.name}"
+    with ProgressDisplay(title, quiet=options.json, is_behind=is_behind) as display:
         yield display.update
-
-
-def _say(line: str) -> None:
-    show(line)
