@@ -9,6 +9,8 @@ from typing import Any, Final, Self, TypeVar
 from nodes.support.termination import TERMINATION
 
 T = TypeVar("T")
+_BACKGROUND: Final = (signal.SIGTTIN, signal.SIGTTOU)
+"""Stop a program that reads its terminal, or writes to it (``stty tostop``), in the background of a shell."""
 
 
 class Terminated(KeyboardInterrupt):
@@ -25,7 +27,8 @@ def run_to_end(
 ) -> T:
     """Run JOB in a loop of its own; the first Ctrl-C, SIGTERM or SIGHUP cancels it, others change nothing.
 
-    When it has ended, KeyboardInterrupt or Terminated is raised for the signal.
+    When it has ended, KeyboardInterrupt or Terminated is raised for the signal. In the background of a shell
+    JOB is not stopped for what it writes to the terminal; what it reads there fails.
     """
     with _Interrupts() as interrupts:
         try:
@@ -57,6 +60,7 @@ class _Interrupts:
 
     def __enter__(self) -> Self:
         self._handlers = {number: signal.signal(number, self._note) for number in self._numbers}
+        self._handlers |= {number: signal.signal(number, signal.SIG_IGN) for number in _BACKGROUND}
         return self
 
     def __exit__(

@@ -1,6 +1,7 @@
 """G-code typed at the terminal of a service: one line after the other, while clients are connected.
 
 M112 does not wait for the line before it: it stops the machine when it comes; lines that wait are left out.
+In the background of a shell nothing is read: what is typed is for the shell, and who reads it is stopped.
 """
 
 import asyncio
@@ -22,6 +23,8 @@ LINES_MAX: Final = 1000
 _READ_BYTES: Final = 4096
 _TYPED_BYTES_MAX: Final = 16_384
 """Of lines that wait for the loop; more wait in the terminal."""
+_LOOK_AGAIN_S: Final = 0.5
+"""While a shell has the terminal: so long after something was typed."""
 _NUMBER: Final = EMERGENCY.removeprefix("M").encode()
 """In every line with that command."""
 
@@ -47,11 +50,13 @@ class Typed:
         """Whether the input has."""
         self._lines: asyncio.Queue[str] = asyncio.Queue(LINES_MAX)
         self._work = asyncio.ensure_future(self._work_off())
+        self._look_again: asyncio.TimerHandle | None = None
         self._loop.add_reader(self._fd, self._read)
 
     def close(self) -> None:
         """Leave the terminal alone."""
-        self._loop.remove_reader(self._fd)
+        self._ended = True
+        self._stop_looking()
         self._work.cancel()
 
     # ---- In the loop, or in the thread that looks for a stop ----
@@ -75,13 +80,24 @@ class Typed:
         """Read what was typed, as far as there is room for it; a terminal gives one line at a time."""
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
-        while len(self._typed) < _TYPED_BYTES_MAX and not self._ended and poll.poll(0):
+        while (
+            len(self._typed) < _TYPED_BYTES_MAX and not self._ended and poll.poll(0) and self._has_terminal()
+        ):
             try:
                 data = os.read(self._fd, _READ_BYTES)
-            except OSError:  # the terminal is gone
-                data = b""
+            except OSError:
+                if not self._has_terminal():  # any more
+                    return
+                data = b""  # it is gone
             self._typed += data
             self._ended = not data
+
+    def _has_terminal(self) -> bool:
+        """Return whether what is typed is for this program: it is not in the background."""
+        try:
+            return os.tcgetpgrp(self._fd) == os.getpgrp()
+        except OSError:  # it is not that of a shell
+            return True
 
     # ---- In the loop ----
 
@@ -89,9 +105,19 @@ class Typed:
         with self._lock:
             self._read_waiting()
             data, self._typed = bytes(self._typed), bytearray()
-            if self._ended:
-                self._loop.remove_reader(self._fd)
+        if self._ended:
+            self._stop_looking()
+        elif not self._has_terminal():
+            self._stop_looking()
+            self._look_again = self._loop.call_later(
+                _LOOK_AGAIN_S, self._loop.add_reader, self._fd, self._read
+            )
         self._take(data)
+
+    def _stop_looking(self) -> None:
+        self._loop.remove_reader(self._fd)
+        if self._look_again is not None:
+            self._look_again.cancel()
 
     def _take(self, data: bytes) -> None:
         *lines, self._rest = (self._rest + data).split(b"\n")
