@@ -32,7 +32,7 @@ MAX_CROSS_SECTION = FloatOption(
 )
 MAX_ONLY_DISTANCE = FloatOption(
     name="max_extrude_only_distance",
-    help="longest move of filament alone",
+    help="longest move of filament alone, and longest retraction",
     default=50.0,
     unit="mm",
     minimum=0,

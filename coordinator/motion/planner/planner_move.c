@@ -117,6 +117,8 @@ static int check_path(struct planner *p, struct planned_move *move, const double
     limit(move, fabs(move->ratio[AXIS_Z]), l->max_z_velocity, l->max_z_accel);
     if (l->tower_rod > 0)
         limit_towers(p, move, target);
+    if (ratio < 0 && !(-delta_e <= l->max_extrude_only_distance))
+        return planner_refuse(p, PLANNER_EXTRUDE_LONG, AXIS_E, -delta_e, 0, l->max_extrude_only_distance);
     if (ratio > l->max_extrude_ratio && delta_e > l->max_extrude_ratio * TINY_PATH)
         return planner_refuse(p, PLANNER_EXTRUDE_RATIO, AXIS_E, ratio, 0, l->max_extrude_ratio);
     if (ratio < 0 || ratio > l->max_extrude_ratio)

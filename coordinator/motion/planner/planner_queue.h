@@ -32,7 +32,7 @@ enum planner_fault_kind {
     PLANNER_NO_FAULT,
     PLANNER_NOT_HOMED,     // axis
     PLANNER_OUTSIDE,       // axis; value: where to (mm), bounds low and high
-    PLANNER_EXTRUDE_LONG,  // value: mm of filament in one move of E alone, bound high
+    PLANNER_EXTRUDE_LONG,  // value: mm of filament in one move of E alone or backward, bound high
     PLANNER_EXTRUDE_RATIO, // value: mm of filament per mm of path, bound high
     PLANNER_SPEED,         // value: mm/s, below the bound low (or not a number)
     PLANNER_TOO_FAR,       // value: mm from the Z axis at the end, bound high

@@ -244,6 +244,8 @@ def test_dwell_and_restart() -> None:
         (b"G1 Z-0.01", FaultKind.OUTSIDE, "Z -0.01 mm, outside 0 to 250 mm"),
         (b"G1 Y999999999999999999", FaultKind.OUTSIDE, "outside 0 to 250 mm"),
         (b"G1 E51", FaultKind.EXTRUDE_LONG, "51 mm of filament at once, more than 50 mm"),
+        (b"G1 X6 E-51", FaultKind.EXTRUDE_LONG, "51 mm of filament at once, more than 50 mm"),
+        (b"G1 X5.001 E-99999999", FaultKind.EXTRUDE_LONG, "filament at once, more than 50 mm"),
         (b"G1 X6 E3", FaultKind.EXTRUDE_RATIO, "3 mm of filament per mm of path, more than 2.08"),
         (b"G1 F0 X1", FaultKind.SPEED, "0 mm/s"),
         (b"G1 F-100 X1", FaultKind.SPEED, "not above 0"),
