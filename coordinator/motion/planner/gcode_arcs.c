@@ -87,6 +87,8 @@ int gcode_arc_begin(struct gcode_state *state, struct planner *planner, const st
     memcpy(arc.start, state->position, sizeof arc.start);
     gcode_target(state, words, arc.target);
     arc.speed = gcode_speed(state, words);
+    if (arc.speed < 0)
+        return GCODE_ARC_SPEED;
     int fault = find_center(state, words, clockwise, &arc);
     if (fault)
         return fault;

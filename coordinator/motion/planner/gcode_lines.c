@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "coordinator/motion/planner/gcode_internal.h"
+#include "coordinator/motion/planner/planner_internal.h"
 #include <math.h>
 #include <string.h>
 
@@ -313,6 +314,8 @@ int gcode_move(struct gcode_state *state, struct planner *planner, const struct 
     double target[4], speed = gcode_speed(state, words);
     gcode_target(state, words, target);
     planner->line = (int64_t)state->lines + 1;
+    if (speed < 0) // also where nothing moves: it would be saved, and refused when it is restored
+        return planner_refuse(planner, PLANNER_SPEED, 0, speed, 0, INFINITY);
     if ((words->given & GCODE_AXIS_WORDS) && gcode_go(state, planner, target, speed))
         return -1;
     state->speed = speed;

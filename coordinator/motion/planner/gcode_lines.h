@@ -51,6 +51,7 @@ enum gcode_arc_fault {
     GCODE_ARC_NO_CENTER, // neither I J K of the plane nor R, or both
     GCODE_ARC_RADIUS,    // R is too short for the way, or the way is none
     GCODE_ARC_UNEQUAL,   // the center is not as far from the end as from the start
+    GCODE_ARC_SPEED,     // F is below 0
     GCODE_ARC_HUGE,      // beyond what can be calculated, or more than 2^20 pieces
 };
 
@@ -92,7 +93,8 @@ struct gcode_words {
 int gcode_feed(struct gcode_state *state, struct planner *planner, const char *text, size_t size,
                size_t *offset, int final);
 
-// Acts on the words of a G0/G1 line. Call planner_ready first. Returns 0, or -1 as planner_add.
+// Acts on the words of a G0/G1 line. Call planner_ready first. Returns 0, or -1 as planner_add; F below 0 is
+// refused also where nothing moves.
 int gcode_move(struct gcode_state *state, struct planner *planner, const struct gcode_words *words);
 
 // Begins the arc of a G2 or G3 line; gcode_arc_go_on plans it. Returns an enum gcode_arc_fault; with any but

@@ -41,6 +41,7 @@ class ArcFault(IntEnum):
     NO_CENTER = lib.GCODE_ARC_NO_CENTER
     RADIUS = lib.GCODE_ARC_RADIUS
     UNEQUAL = lib.GCODE_ARC_UNEQUAL
+    SPEED = lib.GCODE_ARC_SPEED
     HUGE = lib.GCODE_ARC_HUGE
 
     def __str__(self) -> str:
@@ -52,6 +53,7 @@ _ARC_FAULTS: Final[Mapping[ArcFault, str]] = {
     ArcFault.NO_CENTER: "needs its center, either as I, J or K of its plane or as the radius R",
     ArcFault.RADIUS: "has a radius R that does not reach from its start to its end; correct the program",
     ArcFault.UNEQUAL: "has a center that is not as far from its end as from its start; correct the program",
+    ArcFault.SPEED: "has a speed F below 0; give a positive F (mm/min)",
     ArcFault.HUGE: "is too large; correct the program",
 }
 

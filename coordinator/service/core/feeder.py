@@ -27,7 +27,6 @@ from coordinator.gcode.events import (
     Timed,
 )
 from coordinator.gcode.machine_state import MachineState, SavedState
-from coordinator.gcode.parser import WordError
 from coordinator.motion.planner.language import SuspendedProgram
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.core.work import NO_PROGRESS, LinesWork, Rest, Setting, Work
@@ -283,7 +282,7 @@ class Feeder:
         suspended = self.planner.suspend_program()
         try:
             done = not lost and come_back(self.planner, saved, COME_BACK_MM_S)
-        except WordError as error:
+        except ValueError as error:
             problem = str(error)
         self.planner.resume_program(suspended)
         if lost:

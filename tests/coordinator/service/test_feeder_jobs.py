@@ -9,6 +9,7 @@ from coordinator.gcode.events import Done, End, Event, Full, Idle, Notice, Reply
 from coordinator.gcode.program import Program
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.modules.status.print_stats import PrintStats
+from coordinator.service.core import feeder
 from coordinator.service.core.feeder import Feeder, QueuedWork
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork
 from tests.stages.program_stage import ProgramStage
@@ -211,6 +212,32 @@ def test_without_its_homing_a_job_stays_paused(fed: Fed) -> None:
     fed.drive()
     assert job.error is None
     assert fed.at[:2] == (70, 60)
+
+
+def test_a_speed_below_0_ends_the_job_before_any_state_has_it(fed: Fed) -> None:
+    """Failed before: F alone was kept, a pause saved it, and resuming stopped all nodes."""
+    job = fed.job(*BEGIN, "G1 F-100", "PAUSE", "G1 X70")
+    fed.drive()
+    assert "job.gcode:8: the speed is -1.667 mm/s, which is not above 0" in str(job.error)
+
+
+def test_a_way_back_that_is_refused_leaves_the_job_paused(fed: Fed, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = fed.job(*BEGIN, "PAUSE", "G1 X70", "M114")
+    fed.drive()
+
+    def refuse(*_: object) -> bool:
+        raise ValueError("the speed is -1.0")
+
+    with monkeypatch.context() as refusing:
+        refusing.setattr(feeder, "come_back", refuse)
+        fed.feeder.resume()
+        fed.drive()
+    assert fed.feeder.paused
+    assert fed.output[-1] == "job.gcode stays paused: the speed is -1.0"
+    fed.feeder.resume()
+    fed.drive()
+    assert job.error is None
+    assert fed.output[-1].startswith("X:70.000")
 
 
 def test_a_job_cancels_itself_and_its_macro_goes_to_its_end(fed: Fed) -> None:

@@ -9,6 +9,7 @@ from operator import xor
 import numpy as np
 import pytest
 
+from coordinator.motion.planner.language import ArcFault
 from coordinator.motion.planner.planner import RING_TRAPEZOIDS, FaultKind, FeedStatus, Planner
 from coordinator.motion.trapezoid_array import array_of
 from tests.coordinator.motion.planner_helpers import (
@@ -249,6 +250,7 @@ def test_dwell_and_restart() -> None:
         (b"G1 X6 E3", FaultKind.EXTRUDE_RATIO, "3 mm of filament per mm of path, more than 2.08"),
         (b"G1 F0 X1", FaultKind.SPEED, "0 mm/s"),
         (b"G1 F-100 X1", FaultKind.SPEED, "not above 0"),
+        (b"G1 F-100", FaultKind.SPEED, "not above 0"),
     ],
 )
 def test_refused_moves_change_nothing(text: bytes, kind: FaultKind, sentence: str) -> None:
@@ -259,6 +261,18 @@ def test_refused_moves_change_nothing(text: bytes, kind: FaultKind, sentence: st
     assert sentence in str(planner.fault)
     assert planner.toolhead_position == planner.gcode_position == (5, 0, 0, 0)
     assert planner.speed_mm_s == 25
+
+
+def test_a_speed_below_0_is_refused_also_where_nothing_moves() -> None:
+    planner = homed_planner()
+    planner.excluded = True
+    for text in (b"G1 X9 F-1", b"G2 I5 F-1", b"G1 F-.0000001"):
+        feed = planner.feed(text, 0, len(text), final=True)
+        assert feed.status is not FeedStatus.NEED_DATA, text
+    assert planner.begin_arc({"I": 5.0, "F": -1.0}, clockwise=True) is ArcFault.SPEED
+    assert (planner.speed_mm_s, planner.gcode_position) == (25, (0, 0, 0, 0))
+    assert planner.feed(b"G1 F0", 0, 5, final=True).status is FeedStatus.NEED_DATA
+    assert planner.speed_mm_s == 0, "which no move takes, but a program may say it"
 
 
 def test_an_axis_moves_only_when_it_is_homed() -> None:
