@@ -101,6 +101,8 @@ int gcode_arc_begin(struct gcode_state *state, struct planner *planner, const st
     arc.pieces = count_pieces(state, &arc);
     if (!arc.pieces)
         return GCODE_ARC_HUGE;
+    if (state->excluded) // then only its end counts, and no full planner interrupts the pieces
+        arc.pieces = 1;
     planner->line = (int64_t)state->lines + 1;
     state->speed = arc.speed;
     state->arc = arc;

@@ -183,6 +183,20 @@ def test_what_is_no_arc_changes_nothing(words: dict[str, float], fault: ArcFault
     assert str(fault)
 
 
+def test_an_arc_that_is_left_out_goes_to_its_end_at_once() -> None:
+    """Failed before: it was followed in up to 2^20 pieces, 20 ms for a line of 11 bytes."""
+    planner = at_start()
+    planner.excluded = True
+    for text, end, retracted_mm in (
+        (b"G2 I166000 E3\n", (*START, 3.0), 0.0),
+        (b"G3 X110 Y120 Z121 I10 E1 F3000\n", (110.0, 120.0, 121.0, 1.0), 2.0),
+    ):
+        assert planner.feed(text, 0, len(text), final=True).status is FeedStatus.NEED_DATA
+        assert (planner._state.arc.pieces, planner.arc_open) == (1, False)
+        assert (planner.gcode_position, planner.retracted_mm) == (end, retracted_mm)
+    assert (planner.toolhead_position, planner.speed_mm_s) == ((*START, 0.0), 50.0)
+
+
 def test_limits_hold_on_the_way() -> None:
     planner = at_start()
     text = b"G2 X102 I1 J160\n"  # both ends are inside, the way is not
