@@ -8,6 +8,7 @@ from coordinator.gcode.parser import WordError, parse
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.klippy_api.params import RequestError
 from coordinator.klippy_api.status import state_of
+from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.service.api.motion import RESTARTS, run_script
 from coordinator.service.core.machine_service import MachineService
 from coordinator.streaming.move_source import ProgramOutput
@@ -52,10 +53,12 @@ async def run_lines(service: MachineService, lines: Sequence[str], say: Callable
 
 
 def _answer(service: MachineService, line: str, say: Callable[[str], None]) -> None:
-    """Answer what a machine that stopped still knows."""
-    known = service.up_machine().modules.vocabulary.commands
+    """Answer what a machine that stopped still knows; for a macro, what it replaced: nothing is rendered."""
+    modules = service.up_machine().modules
     command = parse(line.encode(errors="replace"))
-    reader = None if command is None else known.get(command.name)
+    renamed = {macro.command: macro.renamed for macro in modules.of(GCodeMacro)}
+    name = "" if command is None else renamed.get(command.name, command.name)
+    reader = modules.vocabulary.commands.get(name)
     if command is None or reader is None:
         raise WordError(f"this machine does not know {line.strip()[:40]}")
     reading = reader.read(Call(command, 0, (0.0,) * 4, ""))

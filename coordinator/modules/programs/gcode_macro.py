@@ -113,11 +113,14 @@ class GCodeMacro(Module):
         self._template = GCodeTemplate(build, GCODE)
         self.variables = {name: _first_value(build, name, raw.value) for name, raw in _family(build)}
         self._shown = {name: plain(value) for name, value in self.variables.items()}
-        rename = (build.find(RENAME) or "").upper()
-        if rename and not _is_command(rename):
+        self.renamed = (build.find(RENAME) or "").upper()
+        """The command that had its name before; empty: none."""
+        if self.renamed and not _is_command(self.renamed):
             raise build.reader.bad(RENAME, "is no name that a command can have")
         help_ = " ".join(build.get(DESCRIPTION).split()) or "G-Code macro"
-        build.replace_command(GCodeCommand(self.command, help_, self._read, while_printing=True), rename)
+        build.replace_command(
+            GCodeCommand(self.command, help_, self._read, while_printing=True), self.renamed
+        )
         build.shared(Variables)
 
     def status(self) -> Mapping[str, Value]:

@@ -565,6 +565,25 @@ def test_a_stopped_machine_answers_one_line_in_a_turn_of_the_loop(tmp_path: Path
     printer.serve(main)
 
 
+def test_a_stopped_machine_answers_without_its_macros(tmp_path: Path) -> None:
+    """Failed before: a macro named as what is answered was rendered on the control loop, and did nothing."""
+    macro = "\n[gcode_macro M115]\nrename_existing: M115.1\ngcode:\n    {action_respond_info('rendered')}\n"
+    printer = Printer(tmp_path, PRINTING + macro)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client = api.connect()
+            await client.listen()
+            await client.ask("emergency_stop")
+            client.said()
+            await client.script("M115")
+            await asyncio.sleep(0)
+            (said,) = client.said()
+            assert said.startswith("FIRMWARE_NAME:")
+
+    printer.serve(main)
+
+
 def test_scripts_are_read_one_in_a_turn_of_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Failed before: of all clients together in one turn, 2 ms each; also those of ``gcode.run``."""
     printer = Printer(tmp_path, PRINTING)
