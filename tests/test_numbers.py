@@ -16,7 +16,8 @@ from nodes.support.option_values import UsageError, parse_float, parse_hex, pars
 
 NO_NUMBERS: Final = ("", "nan", "inf", "-Infinity", "1_0", "١٢", "1e999", "1e16", "0x", "1e", "--1", "1 2",
                      "1" * 41, "1.5.", "½", "１")  # fmt: skip # noqa: RUF001
-NUMBERS: Final = {"0": 0.0, "-1.5": -1.5, "+.5": 0.5, "2.": 2.0, "1e3": 1000.0, "12E-1": 1.2}
+NUMBERS: Final = {"0": 0.0, "-1.5": -1.5, "+.5": 0.5, "2.": 2.0, "1e3": 1000.0, "12E-1": 1.2,
+                  "1e-12": 1e-12, "9e-13": 0.0, "-1e-320": 0.0}  # fmt: skip
 WAYS_IN: Final[dict[str, Callable[[str], object]]] = {
     "G-code, macros' results": lambda text: number("M104", {"S": text}, "S"),
     "configuration": FloatOption(name="x", help="").parse,

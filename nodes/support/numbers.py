@@ -9,6 +9,9 @@ from typing import Final
 CHARS_MAX: Final = 40
 MAGNITUDE_MAX: Final = 1e15
 """Beyond it a float does not hold every whole number, and nothing here is that large."""
+MAGNITUDE_MIN: Final = 1e-12
+"""Below it a number counts as 0, which checks for what must be above 0 refuse: nothing that is divided by the
+other ones overflows."""
 _DECIMAL: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _WHOLE: Final = re.compile(r"[+-]?\d+", re.ASCII)
 _HEX: Final = re.compile(r"0[xX][0-9a-fA-F]+", re.ASCII)
@@ -22,7 +25,7 @@ def read_decimal(text: str) -> float | None:
         or not abs(value := float(text)) <= MAGNITUDE_MAX
     ):
         return None
-    return value
+    return value if abs(value) >= MAGNITUDE_MIN else 0.0
 
 
 def read_int(text: str, *, may_be_hex: bool = False) -> int | None:

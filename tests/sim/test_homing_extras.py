@@ -178,6 +178,7 @@ def test_one_motor_moves_alone_and_the_place_can_be_said(tmp_path: Path) -> None
         ("FORCE_MOVE STEPPER=stepper_x VELOCITY=5", "has no DISTANCE"),
         ("FORCE_MOVE STEPPER=stepper_x DISTANCE=nan VELOCITY=5", "DISTANCE of FORCE_MOVE is 'nan'"),
         ("FORCE_MOVE STEPPER=stepper_x DISTANCE=2000 VELOCITY=5", "-1000 to 1000 are possible"),
+        ("FORCE_MOVE STEPPER=stepper_x DISTANCE=1 VELOCITY=5 ACCEL=1e-9", "must be at least 0.001 mm/s²"),
         ("SET_KINEMATIC_POSITION X=a", "X of SET_KINEMATIC_POSITION is 'a'"),
         ("SET_KINEMATIC_POSITION SET_HOMED=Q", "must be letters of X Y Z"),
     ],

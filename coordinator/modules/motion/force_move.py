@@ -22,6 +22,7 @@ ENABLE: Final = BoolOption(
 )
 DISTANCE_MAX_MM: Final = 1000.0
 SPEED_MAX: Final = 10_000.0
+ACCEL_MIN: Final = 1e-3
 ACCEL_MAX: Final = 1_000_000.0
 _AXES: Final = "XYZ"
 
@@ -58,6 +59,8 @@ class ForceMove(Module):
         speed = bounded(call.command, values, "VELOCITY", 0.0, low=1e-3, high=SPEED_MAX)
         limits = self._machine.limits
         accel = bounded(call.command, values, "ACCEL", 0.0, low=0.0, high=ACCEL_MAX)
+        if 0 < accel < ACCEL_MIN:
+            raise WordError(f"ACCEL of FORCE_MOVE is {accel:g}; it must be at least {ACCEL_MIN:g} mm/s²")
         of_head = name in [motor.name for motor in self._machine.motors]
         done = Done(position=call.position, unhomed=_AXES if of_head else "", moved=True)
 

@@ -71,6 +71,7 @@ def test_its_own_error_names_it() -> None:
         ("COMMAND=M118", "has no PARAMETER"),
         ("COMMAND=M118 PARAMETER=1", "such as SET_PRESSURE_ADVANCE"),
         ("COMMAND=NIX PARAMETER=V", "'NIX', which is no command"),
+        ("COMMAND=M118 PARAMETER=V STEP_DELTA=1 STEP_HEIGHT=1e-320", "needs both STEP_DELTA and STEP_HEIGHT"),
         ("COMMAND=M118 PARAMETER=V STEP_DELTA=1", "needs both STEP_DELTA and STEP_HEIGHT"),
         ("COMMAND=M118 PARAMETER=V STEP_DELTA=1 STEP_HEIGHT=1 FACTOR=1", "leave two"),
         ("COMMAND=M118 PARAMETER=V FACTOR=x", "'x', which is not a number"),
