@@ -17,6 +17,7 @@ from coordinator.gcode.commands import (
     AtStandstill,
     BuiltIn,
     Call,
+    GCodeCommand,
     Immediate,
     Lines,
     Phases,
@@ -48,6 +49,8 @@ from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.gcode.status import Figures, MotionStatus
 from coordinator.motion.planner.language import READ_IN_C
 from coordinator.motion.planner.planner import Feed, FeedStatus, Planner
+from coordinator.support.bug_log import log_bug
+from nodes.support.errors import CanductorError
 
 QUOTE = "'"
 MAX_NOTICES = 100
@@ -341,8 +344,21 @@ class Job(ProgramContext):
         known = known or self.vocabulary.commands.get(command.name)
         if known is not None:
             self._check_while_printing(command, allowed=known.while_printing)
-            return self.follow(command, known.read(self.call(command)))
+            return self.follow(command, self._read(known, command))
         return self._act_built_in(command)
+
+    def _read(self, known: GCodeCommand, command: Command) -> Reading:
+        """Return what COMMAND means to the module that KNOWN is of.
+
+        A bug there ends this program alone: reading changes nothing. What acts may leave the planner and step
+        generation at odds, and stops the machine.
+        """
+        try:
+            return known.read(self.call(command))
+        except (CanductorError, ValueError):
+            raise
+        except Exception as bug:
+            raise WordError(log_bug(bug)) from bug
 
     def _act_built_in(self, command: Command) -> bool:
         handler = basic_commands.HANDLERS.get(command.name)

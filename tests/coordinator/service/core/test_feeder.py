@@ -1,8 +1,13 @@
 """The feeder's promises, driven as the streamer's worker drives it; no clock, no thread."""
 
+import tempfile
+from pathlib import Path
+from typing import Any
+
 import pytest
 
 from coordinator.assembly.load import load_machine
+from coordinator.gcode.commands import GCodeCommand, Immediate, Vocabulary
 from coordinator.gcode.events import Emergency, End, Event, Full, Idle, PositionSet, Reply
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
@@ -102,6 +107,32 @@ def test_a_bad_line_ends_its_own_work_at_rest(feeder: Feeder) -> None:
     assert "client:3: G5 curves" in str(bad.error)
     assert good.error is None
     assert [output.text for output in good.output] == ["X:10.000 Y:0.000 Z:0.000 E:0.000"]
+
+
+def test_a_bug_in_the_reader_of_a_command_ends_only_its_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Failed before: the exception ended the motion worker, which stopped all nodes."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def fail(*_: object) -> Any:
+        raise ZeroDivisionError("of nothing")
+
+    read = GCodeCommand("READ", "for the test", fail)
+    act = GCodeCommand("ACT", "for the test", lambda _: Immediate(act=fail))
+    vocabulary = Vocabulary({"READ": read, "ACT": act})
+    feeder = Feeder(Planner(LIMITS), {"X": 0.0, "Y": 0.0, "Z": 0.0}, MachineState(), vocabulary)
+    bad, good = (feeder.submit(LinesWork([line, "M114"])) for line in ("READ", "G28"))
+    drive(feeder)
+    (log,) = tmp_path.iterdir()
+    assert str(bad.error) == (
+        f"client:1: internal error: ZeroDivisionError: of nothing; please report it with {log}"
+    )
+    assert "in fail" in log.read_text()
+    assert (bad.output, good.error, len(good.output)) == ([], None, 2)
+    feeder.submit(LinesWork(["ACT"]))
+    with pytest.raises(ZeroDivisionError):  # it may have done half of what it does
+        drive(feeder)
 
 
 def test_pause_reads_no_line_and_resume_the_next_one(feeder: Feeder) -> None:
