@@ -1,6 +1,6 @@
 """What a service does for modules. There is none where a file is run or a program is planned."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 
@@ -9,18 +9,29 @@ class Runner(Protocol):
 
     @property
     def busy(self) -> bool:
-        """Whether anything moves, is done or waits; a paused job alone does not count."""
+        """Whether there is a job that is not paused, or anything moves, dwells or waits.
+
+        Lines that only answer or set something do not either, however often they come.
+        """
         ...
 
     @property
-    def works(self) -> int:
-        """How much was done so far: a number that grows with every end of a job, of lines, of a move."""
+    def moved(self) -> int:
+        """How many jobs, lines of clients and the like have moved anything so far."""
         ...
 
-    def run_lines(self, name: str, lines: Sequence[str], text: str = "") -> None:
+    @property
+    def paused(self) -> bool:
+        """Whether there is a job that is paused."""
+        ...
+
+    def run_lines(
+        self, name: str, lines: Sequence[str], text: str = "", *, on_end: Callable[[], None] = ...
+    ) -> None:
         """Run g-code LINES as those of a client; NAME is for messages. Errors are logged.
 
         TEXT is what they stand for: a job is paused first if there are words in it that pause or cancel one.
+        ON_END is called when they have ended, in whatever way, unless the machine stops or restarts.
         """
 
     def live_motion(self) -> tuple[Sequence[float], float, float] | None:

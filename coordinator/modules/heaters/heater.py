@@ -79,6 +79,8 @@ class Heater:
         self.input.on_measured = self._measured
         self.settings = ControlSettings(build)
         self.target_c = 0.0
+        self.changes = 0
+        """How often it was given another target."""
         self.power = 0.0
         """What is applied now, 0..1."""
         self.controller: Controller | None = self.settings.controller()
@@ -193,6 +195,7 @@ class Heater:
 
         A calibration ends when its heater is switched off.
         """
+        self.changes += celsius != self.target_c
         self.target_c, self._off_because = celsius, None
         if celsius <= 0:
             if self._tuning is not None:

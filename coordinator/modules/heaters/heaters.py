@@ -61,6 +61,21 @@ class HeaterRegistry(Module):
         """Whether a heater is on."""
         return any(unit.controls for unit in self.units.values())
 
+    @property
+    def changes(self) -> int:
+        """How often a heater was given another target."""
+        return sum(unit.changes for unit in self.units.values())
+
+    @property
+    def targets(self) -> dict[str, float]:
+        """The targets of the heaters that have one, °C, by their names."""
+        return {name: unit.target_c for name, unit in self.units.items() if unit.target_c > 0}
+
+    def turn_off(self) -> None:
+        """Turn all heaters off; on the control loop."""
+        for unit in self.units.values():
+            unit.set_target(0.0)
+
     def add(self, unit: Heater, tag: str = "") -> None:
         """Register a heater; TAG is its name in M105."""
         self.units[unit.key] = unit
@@ -138,12 +153,7 @@ class HeaterRegistry(Module):
 
     def _turn_off(self, call: Call) -> Reading:
         call.parameters()
-
-        def act(_: float) -> None:
-            for unit in self.units.values():
-                unit.set_target(0.0)
-
-        return Synchronized(act)
+        return Synchronized(lambda _: self.turn_off())
 
     def _unit(self, call: Call, given: Mapping[str, str]) -> Heater:
         names = {name: unit for unit in self.units.values() for name in (unit.key, unit.name)}

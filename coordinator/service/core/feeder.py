@@ -35,6 +35,8 @@ from nodes.support.errors import CanductorError
 WAITING_MAX: Final = 64
 """Works that may wait; more are refused."""
 INTERJECTIONS_MAX: Final = 16
+WAIT_S: Final = 1.0
+"""Lines that stand still for longer wait for something; what only asks a node is over by then."""
 COME_BACK_MM_S: Final = 50.0
 """At which a job goes back to where it was paused."""
 OUTPUT_MAX: Final = 1000
@@ -62,6 +64,10 @@ class QueuedWork:
     """Why it ended before its end."""
     begun_at_s: float | None = None
     """Print time up to which all was planned when it began; None: it waits."""
+    moves_before: int = 0
+    """The planner's moves when it began."""
+    moved: bool = False
+    """Whether it has moved anything so far."""
     read: bool = False
     """Whether nothing more of it will be planned."""
     ends_at_s: float | None = None
@@ -135,11 +141,13 @@ class Feeder:
         interjections = self._interjections or self._interjection or self._interjection_events
         return bool(self.busy or interjections or self.finished or self._closed)
 
-    @property
-    def active(self) -> bool:
-        """Whether anything is being done or waits, but for a job that is paused."""
+    def uses_machine(self, now_s: float) -> bool:
+        """Whether lines, not a job, have moved something or wait at standstill, at print time NOW_S."""
         now = self._now
-        return bool(self._waiting) or (now is not None and not (self._paused and now.is_job))
+        if now is None or now.is_job:
+            return False
+        standstill = now.standstill
+        return now.moved or (standstill is not None and now_s >= standstill.print_time_s + WAIT_S)
 
     @property
     def paused(self) -> bool:
@@ -298,9 +306,15 @@ class Feeder:
     def _begin_or_step(self, queued: QueuedWork) -> Event:
         if queued.begun_at_s is None:
             queued.begun_at_s = self.planner.print_time_end_s
+            queued.moves_before = self.planner.moves
             queued.work.begin(self._setting)
-        queued.standstill = None
-        return queued.work.step()
+        standstill, queued.standstill = queued.standstill, None
+        if standstill is not None and standstill.done is not None:
+            queued.moved = queued.moved or standstill.done.moved
+        try:
+            return queued.work.step()
+        finally:
+            queued.moved = queued.moved or self.planner.moves != queued.moves_before
 
     def _pass_on(self, queued: QueuedWork, event: Event) -> Event:
         """Keep what is the client's, hand on what is the streamer's."""

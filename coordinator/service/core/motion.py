@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
+from typing import Final
 
 from coordinator.gcode.events import Notice
 from coordinator.gcode.status import MotionStatus
@@ -18,6 +19,9 @@ from coordinator.streaming.move_source import Planned, ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.program_machine import machine_state
 from coordinator.streaming.streamer import Streamer
+
+DWELL_S: Final = 2.0
+"""A plan that reaches further ahead while nothing moves has a dwell; else it is only for the next move."""
 
 
 class Motion:
@@ -64,8 +68,8 @@ class Motion:
         self.feeder.on_call = self.streamer.call
         self.begun = asyncio.Event()
         """Set once ``planned`` is known, or never will be: a moment after the machine is ready."""
-        self.works = 0
-        """Done so far."""
+        self.moved = 0
+        """Works so far that have moved anything."""
         self._ending: list[QueuedWork] = []
         self._waited_for: dict[QueuedWork, asyncio.Future[None]] = {}
 
@@ -120,6 +124,13 @@ class Motion:
         return until is not None and self.now_s >= until
 
     @property
+    def in_use(self) -> bool:
+        """Whether anything moves or dwells, or lines that are no job's have moved something or wait."""
+        now_s = self.now_s
+        dwells = self.planned.state.print_time_end_s > now_s + DWELL_S
+        return dwells or not self.standing or self.feeder.uses_machine(now_s)
+
+    @property
     def paused(self) -> bool:
         """Whether a pause has reached its standstill; also one that a missing node caused."""
         return (self.feeder.paused or self.streamer.held is not None) and self.standing
@@ -169,7 +180,7 @@ class Motion:
         if now_s < queued.ends_at_s + self.streamer.worker.steps.lag_s and queued.ends_at_s:
             return False
         queued.done = True
-        self.works += 1
+        self.moved += queued.moved
         done = self._waited_for.get(queued)
         if done is not None and not done.done():
             done.set_result(None)

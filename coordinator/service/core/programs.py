@@ -35,6 +35,10 @@ _STATES: Final[Mapping[JobPhase, str]] = {
 }
 
 
+def _nothing() -> None:
+    pass
+
+
 class Programs:
     """Serves the modules of SERVICE's machine (coordinator/runtime/module_runner.py); on the control loop."""
 
@@ -78,22 +82,30 @@ class Programs:
 
     @property
     def busy(self) -> bool:
-        """Whether anything moves, is done or waits; a paused job alone does not count."""
-        motion = self._service.motion
-        return motion is not None and (motion.feeder.active or not motion.standing)
+        """Whether there is a job that is not paused, or anything moves, dwells or waits."""
+        motion, job = self._service.motion, self._service.active_job
+        return (job is not None and not job.gives_way) or (motion is not None and motion.in_use)
 
     @property
-    def works(self) -> int:
-        """How much was done so far."""
-        return 0 if self._service.motion is None else self._service.motion.works
+    def moved(self) -> int:
+        """How many works have moved anything so far."""
+        return 0 if self._service.motion is None else self._service.motion.moved
 
-    def run_lines(self, name: str, lines: Sequence[str], text: str = "") -> None:
+    @property
+    def paused(self) -> bool:
+        """Whether there is a job that is paused."""
+        job = self._service.active_job
+        return job is not None and job.gives_way
+
+    def run_lines(
+        self, name: str, lines: Sequence[str], text: str = "", *, on_end: Callable[[], None] = _nothing
+    ) -> None:
         """Have g-code LINES done as those of a client."""
         motion = self._service.motion
         if motion is not None and words_in(text) & motion.feeder.vocabulary.interrupting:
-            self.run_paused(name, lines, stay=False)
+            self._start(self._run_paused(LinesWork(lines, name=name), stay=False, on_end=on_end))
         else:
-            self._start(self._run(LinesWork(lines, name=name, rest=Rest.OPEN)))
+            self._start(self._run(LinesWork(lines, name=name, rest=Rest.OPEN), on_end))
 
     def call_remote(self, name: str, values: Mapping[str, object]) -> None:
         """Have every client that registered the method NAME called with VALUES."""
@@ -104,9 +116,11 @@ class Programs:
         """Have LINES done with the job paused."""
         self._start(self._run_paused(LinesWork(lines, name=name), stay=stay))
 
-    async def _run_paused(self, work: LinesWork, *, stay: bool) -> None:
+    async def _run_paused(
+        self, work: LinesWork, *, stay: bool, on_end: Callable[[], None] = _nothing
+    ) -> None:
         with self.interrupted(stay=stay):
-            await self._run(work)
+            await self._run(work, on_end)
 
     @contextlib.contextmanager
     def interrupted(self, *, stay: bool) -> Iterator[None]:
@@ -123,7 +137,7 @@ class Programs:
             if not (stay or paused) and job.phase in (JobPhase.PAUSING, JobPhase.PAUSED):
                 job.resume()
 
-    async def _run(self, work: LinesWork) -> None:
+    async def _run(self, work: LinesWork, on_end: Callable[[], None] = _nothing) -> None:
         motion, job = self._service.motion, self._service.active_job
         if motion is None:
             return
@@ -144,6 +158,7 @@ class Programs:
         else:
             if queued.error is not None:
                 log.add("notice", str(queued.error), ReplyKind.ERROR)
+        on_end()
 
     # ------------------------------------------------------------------------------------ for the job
 

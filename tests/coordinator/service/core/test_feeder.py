@@ -83,6 +83,16 @@ def test_what_moves_nothing_is_done_at_once(feeder: Feeder) -> None:
     assert queued.ends_at_s == 0.0
 
 
+def test_what_has_moved_is_known(feeder: Feeder) -> None:
+    works = [
+        feeder.submit(LinesWork(lines, rest=Rest.OPEN))
+        for lines in (["M114", "M220 S90", "G4 P1"], ["G28"], ["G1 X50 F6000"], ["G1 X50"], ["G1 X60", "G5"])
+    ]
+    works.append(feeder.submit(MoveWork({"X": 1.0}, 50.0, relative=True)))
+    drive(feeder)
+    assert [work.moved for work in works] == [False, False, True, False, True, True]
+
+
 def test_an_open_end_leaves_the_moves_to_be_joined(feeder: Feeder) -> None:
     feeder.submit(LinesWork(["G28"]))
     feeder.submit(LinesWork(["G1 X50 F6000"], rest=Rest.OPEN))
