@@ -17,13 +17,15 @@ from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parameters import bounded, flag
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.homing.homing import Homing
-from coordinator.modules.sensors.temperature_sensor import GCODE_ID, TemperatureSensor
-from coordinator.support.low_pass import LowPass
+from coordinator.modules.sensors.smoothed_temperature import LIMITS, SMOOTH_TIME, SmoothedTemperature
+from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.support.values import Value
 
 STEEPEST: Final = 1.0
 """mm/K."""
 ANY_MM: Final = 99_999_999.0
+MOST_MM: Final = 1.0
+"""A frame of steel or aluminium that is 1 m high grows by that much in 40 to 80 K."""
 COLDEST_C: Final = -273.15
 HOTTEST_C: Final = 1000.0
 LEAST_MM: Final = 5e-4
@@ -37,14 +39,6 @@ TEMP_COEFF: Final = FloatOption(
     minimum=-STEEPEST,
     maximum=STEEPEST,
 )
-SMOOTH_TIME: Final = FloatOption(
-    name="smooth_time",
-    help="time constant of the low pass that the temperature goes through first",
-    default=2.0,
-    unit="s",
-    minimum=0,
-    maximum=3600,
-)
 OFF_ABOVE: Final = FloatOption(
     name="z_adjust_off_above",
     help="above this Z the correction stays as it is",
@@ -56,19 +50,19 @@ OFF_ABOVE: Final = FloatOption(
 MOST: Final = FloatOption(
     name="max_z_adjustment",
     help="largest correction, up or down",
-    default=ANY_MM,
+    default=MOST_MM,
     unit="mm",
     minimum=0,
     maximum=ANY_MM,
 )
 
 
-class ZThermalAdjust(TemperatureSensor):
+class ZThermalAdjust(SmoothedTemperature):
     """The section."""
 
     NAMED: ClassVar = False
     SPEC: ClassVar = SectionSpec(
-        help="Corrects Z for a frame that grows with its temperature",
+        help=f"Corrects Z for a frame that grows with its temperature; {LIMITS}",
         options=(
             *(TEMP_COEFF, SMOOTH_TIME, OFF_ABOVE, MOST),
             *(*SENSOR_OPTIONS, *FREE_SENSOR_OPTIONS, GCODE_ID),
@@ -78,7 +72,7 @@ class ZThermalAdjust(TemperatureSensor):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self._coeff, self._smoothed = build.get(TEMP_COEFF), LowPass(build.get(SMOOTH_TIME))
+        self._coeff = build.get(TEMP_COEFF)
         self._off_above, self._most = build.get(OFF_ABOVE), build.get(MOST)
         self._enabled = True
         self._reference_c: float | None = None
@@ -117,10 +111,6 @@ class ZThermalAdjust(TemperatureSensor):
             if abs(wanted - self._shift_mm) >= LEAST_MM:
                 self._shift_mm = wanted
         return self._shift_mm
-
-    def _measured(self, at_s: float, celsius: float) -> None:
-        super()._measured(at_s, celsius)
-        self._smoothed.take(at_s, celsius)
 
     def _homed(self, axes: str) -> None:
         if "Z" in axes:

@@ -24,19 +24,11 @@ from coordinator.modules.eddy_current.drift_calibration import (
     procedure_of,
 )
 from coordinator.modules.eddy_current.eddy_probe import EddyProbe
-from coordinator.modules.sensors.temperature_sensor import GCODE_ID, TemperatureSensor
-from coordinator.support.low_pass import LowPass
+from coordinator.modules.sensors.smoothed_temperature import LIMITS, SMOOTH_TIME, SmoothedTemperature
+from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
-SMOOTH_TIME: Final = FloatOption(
-    name="smooth_time",
-    help="time constant of the low pass that the temperature goes through first",
-    default=2.0,
-    unit="s",
-    minimum=0,
-    maximum=3600,
-)
 CALIBRATED: Final = FloatOption(
     name="calibration_temp",
     help="of the coil when PROBE_EDDY_CURRENT_CALIBRATE measured; that saves it",
@@ -57,11 +49,11 @@ LOWEST: Final = FloatOption(
 )
 
 
-class TemperatureProbe(TemperatureSensor):
+class TemperatureProbe(SmoothedTemperature):
     """The section."""
 
     SPEC: ClassVar = SectionSpec(
-        help="The temperature of the coil of [probe_eddy_current NAME], which corrects its drift",
+        help=f"The temperature of the coil of [probe_eddy_current NAME], which corrects its drift; {LIMITS}",
         options=(
             *(SMOOTH_TIME, *PROCEDURE_OPTIONS, CALIBRATED, DRIFT, LOWEST),
             *(*SENSOR_OPTIONS, *FREE_SENSOR_OPTIONS, GCODE_ID),
@@ -74,7 +66,6 @@ class TemperatureProbe(TemperatureSensor):
         self.instance = build.instance
         self._place = build.place
         self.procedure = procedure_of(build)
-        self._smoothed = LowPass(build.get(SMOOTH_TIME))
         self._calibrated_c = build.find(CALIBRATED)
         self._drift = build.find(DRIFT)
         self._lowest_c = build.find(LOWEST)
@@ -111,11 +102,6 @@ class TemperatureProbe(TemperatureSensor):
         assert self._probe is not None
         return self._probe
 
-    @property
-    def celsius(self) -> float | None:
-        """How warm the coil is; None: that is not measured."""
-        return self.input.celsius
-
     def status(self) -> Mapping[str, Value]:
         """Report the temperature, and whether it corrects or calibrates."""
         return {
@@ -126,8 +112,7 @@ class TemperatureProbe(TemperatureSensor):
 
     def _measured(self, at_s: float, celsius: float) -> None:
         super()._measured(at_s, celsius)
-        self._smoothed.take(at_s, celsius)
-        if self._probe is not None:
+        if self._probe is not None and self.input.is_sound:
             self._calibration.measured(celsius)
 
     # ------------------------------------------------------------------------------------------ correcting

@@ -118,7 +118,7 @@ class TemperatureFan(FanModule):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.unit = FanUnit(build, FULL)
-        self.input = find_source(build, limits_needed=True)
+        self.input = find_source(build)
         self.input.on_measured = self._measured
         self.usual_target_c = self.target_c = build.get(TARGET_TEMP)
         self._silent = False

@@ -23,7 +23,7 @@ from coordinator.config.sections.sensor_options import (
 from coordinator.heat.chip_sensors import ChipLine, ChipSensor, FactoryPoints, chip_sensor
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.heaters.heaters import HeaterRegistry
-from coordinator.modules.sensors.temperature_input import TemperatureInput
+from coordinator.modules.sensors.temperature_input import TemperatureInput, is_limited, limit
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest_or_all, shown
@@ -235,19 +235,16 @@ _FREE: Final[dict[str, type[ChipTemperature | HostTemperature | CombinedTemperat
 """By sensor_type."""
 
 
-def find_source(build: Build, *, limits_needed: bool) -> TemperatureSource:
+def find_source(build: Build, plausible: tuple[float, float] | None = None) -> TemperatureSource:
     """Return the temperature of section BUILD, whatever its sensor_type; raises ConfigError.
 
-    LIMITS_NEEDED: whether it has to have min_temp and max_temp.
+    PLAUSIBLE: what stands in for a min_temp and a max_temp that are not given; None: they have to be. Where
+    neither is given no reading stops the machine.
     """
     free = _FREE.get(build.get(SENSOR_TYPE))
+    low, high = plausible or (None, None)
     if free is None:
-        if limits_needed:
-            return TemperatureInput(build)
-        return TemperatureInput(build, min_c=LOWEST_C, max_c=HIGHEST_C)
-    low, high = (
-        (build.get(MIN_TEMP), build.get(MAX_TEMP))
-        if limits_needed
-        else (build.find(MIN_TEMP), build.find(MAX_TEMP))
-    )
-    return free(build, LOWEST_C if low is None else low, HIGHEST_C if high is None else high)
+        return TemperatureInput(build, min_c=low, max_c=high)
+    source = free(build, limit(build, MIN_TEMP, low), limit(build, MAX_TEMP, high))
+    source.guarded = plausible is None or is_limited(build)
+    return source

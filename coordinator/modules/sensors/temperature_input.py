@@ -3,6 +3,7 @@
 from typing import Final
 
 from coordinator.config.errors import ConfigError, NotSupported
+from coordinator.config.options import FloatOption
 from coordinator.config.sections.sensor_options import (
     ADC_VOLTAGE,
     FREE_SENSORS,
@@ -53,13 +54,9 @@ class TemperatureInput(TemperatureSource):
         if self._type in UNSUPPORTED_SENSORS:
             place = build.reader.place_of(SENSOR_TYPE)
             raise NotSupported(place, f"its sensor is a {self._type}, which is not supported yet")
-        super().__init__(
-            build.name,
-            build.get(MIN_TEMP) if min_c is None else _or(build.find(MIN_TEMP), min_c),
-            build.get(MAX_TEMP) if max_c is None else _or(build.find(MAX_TEMP), max_c),
-        )
+        super().__init__(build.name, limit(build, MIN_TEMP, min_c), limit(build, MAX_TEMP, max_c))
         self._pin = build.pin(SENSOR_PIN)
-        self._guarded = min_c is None or build.reader.has(MIN_TEMP) or build.reader.has(MAX_TEMP)
+        self.guarded = min_c is None or is_limited(build)
         self._reader = build.reader
         self._circuit = Circuit(
             build.get(PULLUP), build.get(INLINE), build.get(ADC_VOLTAGE), build.get(VOLTAGE_OFFSET)
@@ -73,7 +70,7 @@ class TemperatureInput(TemperatureSource):
     def link(self, modules: Modules) -> None:
         """Find the sensor, and what its converter may read; raises ConfigError."""
         self._sensor = self._find(modules)
-        if not self._guarded:
+        if not self.guarded:
             return
         try:
             limits = ratio_range(self._sensor, self.min_c, self.max_c)
@@ -141,5 +138,14 @@ class SensorModule(Module):
     input: TemperatureSource
 
 
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else value
+def limit(build: Build, option: FloatOption, otherwise: float | None) -> float:
+    """Return MIN_TEMP or MAX_TEMP, OTHERWISE where it is absent; None: it is required; raises ConfigError."""
+    if otherwise is None:
+        return build.get(option)
+    given = build.find(option)
+    return otherwise if given is None else given
+
+
+def is_limited(build: Build) -> bool:
+    """Return whether the section has a min_temp or a max_temp."""
+    return build.reader.has(MIN_TEMP) or build.reader.has(MAX_TEMP)

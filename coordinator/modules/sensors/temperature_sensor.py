@@ -11,7 +11,7 @@ from coordinator.config.sections.sensor_options import (
 )
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.heaters.heaters import HeaterRegistry
-from coordinator.modules.sensors.free_temperatures import find_source
+from coordinator.modules.sensors.free_temperatures import HIGHEST_C, LOWEST_C, find_source
 from coordinator.modules.sensors.temperature_input import SensorModule
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
@@ -34,9 +34,12 @@ class TemperatureSensor(SensorModule):
         unsupported=UNSUPPORTED_SENSOR_OPTIONS,
     )
 
+    PLAUSIBLE: ClassVar = (LOWEST_C, HIGHEST_C)
+    """What min_temp and max_temp are where they are not given."""
+
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self.input = find_source(build, limits_needed=False)
+        self.input = find_source(build, self.PLAUSIBLE)
         self.input.on_measured = self._measured
         self._extremes: tuple[float, float] | None = None
         build.shared(HeaterRegistry).add_sensor(self.input, build.find(GCODE_ID) or "")

@@ -32,6 +32,8 @@ class TemperatureSource:
     def __init__(self, name: str, min_c: float, max_c: float) -> None:
         self.name = name
         self.min_c, self.max_c = min_c, max_c
+        self.guarded = True
+        """Whether readings outside the limits stop the machine."""
         self.celsius: float | None = None
         """The last measurement; None before the first."""
         self.sound_c: float | None = None
@@ -105,7 +107,7 @@ class TemperatureSource:
 
     def _watch(self, live: "ModuleContext", celsius: float) -> None:
         """Stop the machine when CELSIUS stays outside the limits: for sensors that no node checks."""
-        self._bad = 0 if self.min_c <= celsius <= self.max_c else self._bad + 1
+        self._bad = 0 if not self.guarded or self.min_c <= celsius <= self.max_c else self._bad + 1
         if self._bad == BAD_IN_A_ROW:
             live.stop(
                 f"[{self.name}] reads {celsius:.0f} °C, outside its min_temp of {self.min_c:g} and max_temp"
