@@ -16,6 +16,7 @@ from coordinator.modules.programs.save_variables import read_variables
 from coordinator.planning import node_dictionaries
 from coordinator.service.jobs.history import JobHistory
 from coordinator.service.jobs.journal import Journal, read_journal
+from coordinator.support.file_writer import FileWriter
 from coordinator.tables.store import TableStore
 from coordinator.web.session_file import read_sessions
 from nodes.support.errors import CanductorError
@@ -28,7 +29,7 @@ pytestmark = pytest.mark.timeout(60)
 
 def read_history(path: Path) -> list[object]:
     """Return the jobs in the history at PATH."""
-    history = JobHistory(pytest.fail)
+    history = JobHistory(pytest.fail, FileWriter())
     history.open(path)
     return [*history.jobs]
 

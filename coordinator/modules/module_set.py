@@ -32,6 +32,7 @@ from coordinator.motion.planner.planner import Planner
 from coordinator.motion.steps.surface import Surface
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.module_context import ModuleContext
+from coordinator.support.file_writer import FileWriter
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
@@ -69,13 +70,16 @@ class LeftOut:
     """What it depends on that does not act."""
 
 
-def build_modules(machine: MachineDescription) -> "ModuleSet":
-    """Build the modules of MACHINE, linked with each other; raises ConfigError."""
+def build_modules(machine: MachineDescription, files: FileWriter | None = None) -> "ModuleSet":
+    """Build the modules of MACHINE, linked with each other; raises ConfigError.
+
+    FILES writes what they keep; None: one of their own.
+    """
     given = machine.modules
     sources = [source for section in given.sections for source in _sources(section)]
     without: dict[str, NotSupported] = {}
     while True:
-        built = ModuleSet(machine, given.pins.copy(), given.config, given.settings)
+        built = ModuleSet(machine, given.pins.copy(), given.config, given.settings, files)
         for source in sources:
             built.build_or_leave_out(source, without)
         built.add_always()
@@ -133,8 +137,10 @@ class ModuleSet:
         pins: PinRegistry,
         config: Mapping[str, Mapping[str, str]] | None = None,
         settings: Mapping[str, Mapping[str, object]] | None = None,
+        files: FileWriter | None = None,
     ) -> None:
         self.pins = pins
+        self.files = files or FileWriter()
         self.config = config or {}
         self.settings = settings or {}
         self._unsupported = [name for name in self.config if name.partition(" ")[0] in UNSUPPORTED_SECTIONS]

@@ -28,6 +28,7 @@ from coordinator.runtime.node_recovery import NodeRecovery, PausableJob
 from coordinator.runtime.stepper_positions import StepperPositions
 from coordinator.runtime.timebase import ClockMap, TimeBase
 from coordinator.runtime.wire import Wire
+from coordinator.support.file_writer import FileWriter
 from coordinator.support.values import Value
 from nodes.bus.assign import Uuid
 from nodes.bus.bus import UartBus
@@ -70,6 +71,8 @@ class Modules(Protocol):
     notes: list[str]
     """Sentences about what is no mistake."""
     pins: PinRegistry
+    files: FileWriter
+    """Writes what they keep."""
 
     @property
     def vocabulary(self) -> Vocabulary: ...  # noqa: D102

@@ -1,10 +1,10 @@
 """[save_variables]: variables that survive a restart, in a file of their own.
 
 The file is written by a thread, so that neither programs nor the control loop wait for a disk; atomically, so
-that a power cut leaves the old values or the new ones. A machine that is only planned keeps them in memory.
+that a power cut leaves the old values or the new ones. What a slow disk does not have yet when the machine
+is restarted is read from memory. A machine that is only planned keeps them in memory.
 """
 
-import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -17,8 +17,7 @@ from coordinator.gcode.parser import WordError, quoted
 from coordinator.gcode.script_lines import script_lines
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
-from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.atomic_file import atomic_write
+from coordinator.support.file_writer import FileWriter
 from coordinator.support.quoting import shown_path
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
@@ -42,29 +41,22 @@ class SaveVariables(Module):
         self._variables: dict[str, Any] = {}
         self._shown: dict[str, Value] = {}
         """The same, as the status has them."""
-        self._writer: _Writer | None = None
+        self._files = FileWriter()
         build.add_command(
             "SAVE_VARIABLE", "Save VALUE as VARIABLE in the file", self._save, while_printing=True
         )
 
-    def link(self, modules: Modules) -> None:  # noqa: ARG002
+    def link(self, modules: Modules) -> None:
         """Read the file; raises ConfigError."""
+        self._files = modules.files
         try:
-            self._variables = read_variables(self.path)
+            unwritten = self._files.unwritten(self.path)
+            self._variables = (
+                read_variables(self.path) if unwritten is None else _variables_in(self.path, unwritten)
+            )
         except CanductorError as error:
             raise ConfigError(self._place, str(error)) from None
         self._shown = {name: plain(value) for name, value in self._variables.items()}
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Write the file from now on."""
-        # Its thread must not call whoever listens to notices.
-        self._writer = _Writer(self.path, lambda text: live.soon_on_loop(lambda: live.say(text)))
-
-    def close(self) -> None:
-        """Wait until all is written."""
-        if self._writer is not None:
-            self._writer.close()
-        self._writer = None
 
     def status(self) -> Mapping[str, Value]:
         """Report the values."""
@@ -96,10 +88,16 @@ class SaveVariables(Module):
                 )
             self._variables = variables
             self._shown[name] = plain(value)
-            if self._writer is not None:
-                self._writer.write(text)
+            if self._live is not None:
+                self._files.write(self.path, text.encode(), self._fail)
 
         return Immediate(act=act)
+
+    def _fail(self, error: OSError) -> None:
+        """Report ERROR, in a thread that must not call whoever listens to notices."""
+        live, reason = self.live, (error.strerror or str(error)).lower()
+        sentence = f"the file of variables {shown_path(str(self.path))} cannot be written: {reason}"
+        live.soon_on_loop(lambda: live.say(sentence))
 
 
 def read_variables(path: Path) -> dict[str, Any]:
@@ -117,6 +115,11 @@ def read_variables(path: Path) -> dict[str, Any]:
         raise CanductorError(
             f"the file of variables {shown_path(str(path))} is larger than {FILE_BYTES_MAX} bytes"
         )
+    return _variables_in(path, data)
+
+
+def _variables_in(path: Path, data: bytes) -> dict[str, Any]:
+    """Return the values in DATA, the content of the file PATH; raises CanductorError."""
     found: dict[str, Any] = {}
     for number, line in enumerate(script_lines(data.decode("utf-8", "replace")), 1):
         text = line.strip()
@@ -145,40 +148,3 @@ def _check_readable(value: object) -> None:
 def _as_text(variables: Mapping[str, Any]) -> str:
     lines = [f"{name} = {value!r}" for name, value in sorted(variables.items())]
     return "\n".join([_HEADER, *lines, ""])
-
-
-class _Writer:
-    """Writes the newest text to PATH in a thread of its own; of those that come meanwhile, the last."""
-
-    def __init__(self, path: Path, say: "Any") -> None:
-        self._path = path
-        self._say = say
-        self._changed = threading.Condition()
-        self._text: str | None = None
-        self._closing = False
-        self._thread = threading.Thread(target=self._run, name="variables", daemon=True)
-        self._thread.start()
-
-    def write(self, text: str) -> None:
-        with self._changed:
-            self._text = text
-            self._changed.notify()
-
-    def close(self) -> None:
-        with self._changed:
-            self._closing = True
-            self._changed.notify()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._text is not None or self._closing)
-                text, self._text = self._text, None
-            if text is None:
-                return
-            try:
-                atomic_write(self._path, text.encode())
-            except OSError as error:
-                reason = (error.strerror or str(error)).lower()
-                self._say(f"the file of variables {shown_path(str(self._path))} cannot be written: {reason}")

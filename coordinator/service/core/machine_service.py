@@ -42,6 +42,7 @@ from coordinator.service.state.log_ring import Entry, LogRing
 from coordinator.streaming.move_source import ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.support.bug_log import log_bug
+from coordinator.support.file_writer import FileWriter
 from coordinator.support.progress import Progress
 from coordinator.tables.store import TableStore
 from nodes.dictionary.cache import DictionaryCache
@@ -52,6 +53,8 @@ REFRESH_S: Final = 0.1
 """How often the state tree is brought up to date while somebody reads it; else the next look fills it."""
 READ_S: Final = 1.5
 """So long after somebody has read it, it counts as being read."""
+WRITE_S: Final = 10.0
+"""A disk that does not answer must not keep the service from ending; one that is slow gets what was saved."""
 BY_USER: Final = "emergency stop by"
 BY_INTERRUPT: Final = "stopped by the user"
 
@@ -148,7 +151,9 @@ class MachineService:
         self.turns = Turns()
         """For scripts of clients."""
         self.fed = FedJobs(self)
-        self.history = JobHistory(self._notice)
+        self._files = FileWriter()
+        """Of all machines, one after the other: what one of them keeps is what the next one finds."""
+        self.history = JobHistory(self._notice, self._files)
         self._restart = asyncio.Event()
         self._reset_nodes = False
         """At the next start, whatever their configuration."""
@@ -190,7 +195,7 @@ class MachineService:
             await asyncio.gather(refresh, return_exceptions=True)
             await self._let_go()
             await asyncio.to_thread(self.recovery.close)
-            await self.history.close()
+            await self._finish_writing()
             self._unclaim()
 
     async def run_job(
@@ -216,6 +221,7 @@ class MachineService:
                 raise
         finally:
             await self._let_go()
+            await self._finish_writing()
 
     async def _print(
         self, machine: Machine, program: Program, on_progress: Callable[[Progress], None] | None
@@ -266,7 +272,7 @@ class MachineService:
         machine = self.machine = Machine(
             description,
             self.host,
-            build_modules(description),
+            build_modules(description, self._files),
             on_notice=self._notice,
             cache=self._cache,
             reset_nodes=self._reset_nodes,
@@ -347,6 +353,11 @@ class MachineService:
         if self._closing is not None:
             await self._closing.close()
             self._closing = None
+
+    async def _finish_writing(self) -> None:
+        """Wait for the disk, as far as it answers."""
+        if not await asyncio.to_thread(self._files.wait, WRITE_S):
+            self._notice(f"the disk has not answered for {WRITE_S:.0f} s; what was saved last may be lost")
 
     # ------------------------------------------------------------------------------------------- doing
 

@@ -4,6 +4,7 @@ A small file outside the job folder, next to the journal; written when a job has
 """
 
 import asyncio
+import contextlib
 import json
 from collections import deque
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.support.atomic_file import atomic_write
+from coordinator.support.file_writer import FileWriter
 from nodes.support.regular_file import read_regular
 
 HISTORY_MAX: Final = 100
@@ -41,17 +42,16 @@ class EndedJob:
 
 
 class JobHistory:
-    """The last HISTORY_MAX jobs, in memory, and in a file once there is one; on the loop.
+    """The last HISTORY_MAX jobs, in memory, and once there is one in a file that FILES writes; on the loop.
 
     REPORT gets a sentence when the file cannot be written; the history in memory is complete nevertheless.
     """
 
-    def __init__(self, report: Callable[[str], None]) -> None:
+    def __init__(self, report: Callable[[str], None], files: FileWriter) -> None:
         self._path: Path | None = None
         self._report = report
+        self._files = files
         self._jobs: deque[EndedJob] = deque(maxlen=HISTORY_MAX)
-        self._unwritten = False
-        self._writer: asyncio.Task[None] | None = None
 
     @property
     def jobs(self) -> list[EndedJob]:
@@ -69,23 +69,15 @@ class JobHistory:
         self._jobs.append(job)
         if self._path is None:
             return
-        self._unwritten = True
-        if self._writer is None or self._writer.done():
-            self._writer = asyncio.get_running_loop().create_task(self._write(self._path))
+        path, loop = self._path, asyncio.get_running_loop()
 
-    async def close(self) -> None:
-        """Wait until the file is on the disk."""
-        if self._writer is not None:
-            await self._writer
+        def fail(error: OSError) -> None:
+            sentence = f"the history of jobs cannot be written to {path}: {error.strerror or error}"
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self._report, sentence)
 
-    async def _write(self, path: Path) -> None:
-        while self._unwritten:
-            self._unwritten = False
-            data = json.dumps([asdict(job) for job in self._jobs], separators=(",", ":")).encode()
-            try:
-                await asyncio.to_thread(atomic_write, path, data)
-            except OSError as error:
-                self._report(f"the history of jobs cannot be written to {path}: {error.strerror or error}")
+        data = json.dumps([asdict(ended) for ended in self._jobs], separators=(",", ":")).encode()
+        self._files.write(path, data, fail)
 
 
 def _read(path: Path) -> list[EndedJob]:

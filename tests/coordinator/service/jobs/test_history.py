@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.service.jobs.history import HISTORY_MAX, EndedJob, JobHistory
+from coordinator.support.file_writer import FileWriter
 
 JOB = EndedJob(
     file="a.gcode",
@@ -20,8 +21,11 @@ JOB = EndedJob(
 )
 
 
+PATIENCE_S = 60.0
+
+
 def kept(path: Path) -> JobHistory:
-    history = JobHistory(pytest.fail)
+    history = JobHistory(pytest.fail, FileWriter())
     history.open(path)
     return history
 
@@ -31,12 +35,12 @@ def test_it_keeps_the_newest_jobs_in_its_file(tmp_path: Path) -> None:
     jobs = [replace(JOB, file=f"{n}.gcode") for n in range(HISTORY_MAX + 2)]
 
     async def go() -> None:
-        history = JobHistory(pytest.fail)
+        history = JobHistory(pytest.fail, files := FileWriter())
         history.add(jobs[0])  # before there is a file
         history.open(path)
         for job in jobs[1:]:
             history.add(job)
-        await history.close()
+        assert await asyncio.to_thread(files.wait, PATIENCE_S)
         assert history.jobs == jobs[:1:-1]
 
     asyncio.run(go())
@@ -70,10 +74,10 @@ def test_a_file_that_cannot_be_written_is_reported_and_forgets_nothing(tmp_path:
     reports: list[str] = []
 
     async def go() -> None:
-        history = JobHistory(reports.append)
+        history = JobHistory(reports.append, files := FileWriter())
         history.open(tmp_path / "missing" / "history")
         history.add(JOB)
-        await history.close()
+        assert await asyncio.to_thread(files.wait, PATIENCE_S)
         assert history.jobs == [JOB]
 
     asyncio.run(go())
