@@ -1,5 +1,6 @@
 """A switch on a node: pressed or not, each change reported once, in order."""
 
+import contextlib
 from collections.abc import Callable
 from functools import partial
 from typing import Final
@@ -9,6 +10,7 @@ from nodes.devices.ticks import start_clock, ticks_for
 from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
+from nodes.support.errors import CanductorError
 
 COMMANDS: Final = ("config_buttons", "buttons_add", "buttons_query", "buttons_ack")
 POLL_S: Final = 0.002
@@ -64,7 +66,8 @@ class Button(Device):
         if not new:
             return  # an old report; its acknowledgement has arrived since
         self._acked = (self._acked + len(new)) % _ACKS
-        node.send("buttons_ack", oid=self._oid, count=len(new))
+        with contextlib.suppress(CanductorError):  # its node has failed since
+            node.send("buttons_ack", oid=self._oid, count=len(new))
         for state in new:
             self._change(bool(state & 1))
 

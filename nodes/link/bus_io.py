@@ -1,7 +1,7 @@
 """Python wrapper of a bus's I/O thread (io_thread.h): links, raw frames, events in the asyncio loop."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 from nodes.link.handle import BusHandle
@@ -21,6 +21,7 @@ from nodes.link.types import (
     Response,
     TransportKind,
 )
+from nodes.support.bug_reports import BugReports
 from nodes.support.c_structs import from_struct
 
 _BATCH = 128
@@ -76,6 +77,7 @@ class LinkIO:
         self._events = self._ffi.new("struct io_event[]", _BATCH)
         self._goes_on = False
         """Whether the next turn of the loop takes what is left."""
+        self._bugs = BugReports()
         driver.listen(self._handle_events)
 
     @property
@@ -204,7 +206,8 @@ class LinkIO:
         self._hand_over(taken)
 
     def _hand_over(self, taken: int) -> None:
-        # A callback may close this bus or any link: every step checks again.
+        # A callback may close this bus or any link: every step checks again. One that fails must not keep the
+        # others from theirs: notices come once.
         responses: dict[int, list[Response]] = {}
         frames: list[Frame] = []
         notices: list[tuple[int, int, int]] = []
@@ -220,15 +223,22 @@ class LinkIO:
                 notices.append((event.notice, event.link, event.value))
         # Frames first: the frame with which a node stops its bus has the reason, later reports do not.
         for frame in frames:
-            if self._bus.open and self._on_frame:
-                self._on_frame(frame)
+            if self._on_frame:
+                self._guarded("a frame", self._on_frame, frame)
         if taken > 1 and self._bus.open:
             self._pass_on_together(responses)
         else:
             self._pass_on(responses)
         for notice in notices:
-            if self._bus.open:
-                self._handle_notice(*notice)
+            self._guarded("a notice", self._handle_notice, *notice)
+
+    def _guarded(self, what: str, handle: Callable[..., None], *args: object) -> None:
+        """Call HANDLE, unless the bus was closed; if it fails, that is reported."""
+        if self._bus.open:
+            try:
+                handle(*args)
+            except Exception as bug:  # noqa: BLE001
+                self._bugs.add(f"{self.name}: {what}", bug)
 
     def _pass_on_together(self, responses: Mapping[int, Sequence[Response]]) -> None:
         """Pass RESPONSES on so that the commands that follow from them share blocks."""
@@ -242,7 +252,7 @@ class LinkIO:
     def _pass_on(self, responses: Mapping[int, Sequence[Response]]) -> None:
         for number, batch in responses.items():
             if link := self._links.get(number):
-                link.handle_responses(batch)
+                self._guarded("responses", link.handle_responses, batch)
 
     def _handle_notice(self, notice: int, number: int, value: int) -> None:
         if notice == self._lib.IO_ENDED:

@@ -611,11 +611,21 @@ class Node:
         if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:
             return
         text = self.dictionary.enum_name("static_string_id", static_string_id)
-        known = [words for explain in self._explain if (words := explain(text))]
+        known = self._known_of(text)
         if off := self._clock_off(clock):
             known.append(f"{off}: its oscillator is failing, or the host was suspended")
         sentence = shutdown_sentence(self.name, text) + (f" ({'; '.join(known)})" if known else "")
         self._fail(NodeEvent.SHUTDOWN, NodeShutdown(sentence))
+
+    def _known_of(self, reason: str) -> list[str]:
+        """Return what is known of a shutdown for REASON; a bug in that does not hide the shutdown."""
+        known = []
+        for explain in self._explain:
+            try:
+                known.append(explain(reason))
+            except Exception as bug:  # noqa: BLE001
+                self._talk.bugs.add(f"node {self.name}: the reason of its shutdown", bug)
+        return [words for words in known if words]
 
     def _clock_off(self, clock: int | None) -> str:
         """Return how the node's clock is off, also by a CLOCK that the node has read before now, if it is."""

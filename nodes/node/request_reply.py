@@ -14,6 +14,7 @@ from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary, encode_values
 from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value
 from nodes.link.interfaces import LinkInterface
 from nodes.link.types import Response
+from nodes.support.bug_reports import BugReports
 from nodes.support.errors import CanductorError
 
 QUERY_TIMEOUT_S: Final = 0.25
@@ -85,7 +86,12 @@ class _Exchange:
         self._timer = asyncio.get_running_loop().call_later(self._timeout_s, self._expire)
 
     def _expire(self) -> None:
-        self._link.take()  # an answer that came in time may still wait
+        try:
+            self._link.take()  # an answer that came in time may still wait
+        finally:
+            self._repeat()
+
+    def _repeat(self) -> None:
         pending = [answer for answer in self._answers if not answer.done()]
         if self._left and pending:
             try:
@@ -117,6 +123,8 @@ class RequestReply:
         self.dictionary: Dictionary = BOOTSTRAP
         self.undecodable = 0
         """Responses that no format of the dictionary fits: damaged, or from other firmware."""
+        self.bugs = BugReports()
+        """Of what listens to the node."""
         self._link: LinkInterface | None = None
         self._waiters: list[_Waiter] = []
         self._listeners: dict[tuple[str, int | None], list[Callback]] = {}
@@ -287,7 +295,10 @@ class RequestReply:
     # --------------------------------------------------------------------------------------------- receive
 
     def on(self, response: str, oid: int | None, callback: Callback) -> Callable[[], None]:
-        """Call CALLBACK for every RESPONSE (of OID, unless None); return a function that ends it."""
+        """Call CALLBACK for every RESPONSE (of OID, unless None); return a function that ends it.
+
+        What CALLBACK raises is reported as a bug; nobody else's calls depend on it.
+        """
         callbacks = self._listeners.setdefault((response, oid), [])
         callbacks.append(callback)
 
@@ -319,7 +330,10 @@ class RequestReply:
 
     def _call(self, key: tuple[str, int | None], message: Message) -> None:
         for callback in tuple(self._listeners.get(key, ())):
-            callback(message)
+            try:
+                callback(message)
+            except Exception as bug:  # noqa: BLE001 (other listeners and nodes get theirs all the same)
+                self.bugs.add(f"node {self.name}: {message.name}", bug)
 
     def fail(self, error: CanductorError, *, shutdown: bool = False) -> None:
         """End all queries with ERROR; after a SHUTDOWN, only those that do not survive it."""

@@ -243,3 +243,19 @@ def test_reports_that_come_again_and_those_of_before_are_passed_over() -> None:
         assert seen == [True, False, True]
 
     machine.run(main)
+
+
+def test_a_report_that_comes_when_its_node_has_failed_is_taken_all_the_same() -> None:
+    """In one batch with the frame by which its node stops the bus. Failed before: NodeShutdown was raised."""
+    switch, seen = button()
+    machine = DeviceMachine(switch)
+
+    async def main() -> None:
+        await asyncio.sleep(1)
+        machine.node.lose("it is gone")
+        oid = switch.oid
+        assert oid is not None
+        switch._received(machine.node, Message("buttons_state", {"oid": oid, "ack_count": 0, "state": b"\1"}))
+        assert seen == [True]
+
+    machine.run(main)

@@ -277,6 +277,68 @@ def test_a_link_that_a_handler_closes_gets_nothing_more() -> None:
     assert seen == [(0, 3)]
 
 
+def test_a_handler_that_fails_keeps_no_other_from_what_is_for_it() -> None:
+    """Failed before: the rest of the batch was gone, and notices, which come once."""
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError
+
+    async def test() -> None:
+        bugs: list[str] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: bugs.append(context["message"]))
+        ended: list[str] = []
+        bus = Bus(on_frame=fail, on_closed=ended.append)
+        bus.open(LinkSettings(4), on_responses=fail)
+        good = bus.open(LinkSettings(5))
+        good.send(ask(1))
+        waiter = asyncio.ensure_future(good.drained())
+        await asyncio.sleep(0)
+        bus.frames_come(2)
+        bus.responses_come(1)
+        bus.responses_come(3, RESPONSE_ID + 2)
+        lib.io_end(bus.driver.bus, 0)
+        bus.driver.hand_over()
+        assert len(bus.inbox.responses) == 3
+        assert len(ended) == 1
+        with pytest.raises(LinkError, match="the connection ended"):
+            await waiter
+        assert bugs == [
+            f"{what} could not be handled; this is reported once"
+            for what in ("by hand: a frame", "by hand: responses")
+        ]
+
+    asyncio.run(test())
+
+
+def test_a_notice_that_cannot_be_handled_keeps_no_other_from_being_handled() -> None:
+    async def test() -> None:
+        bugs: list[str] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: bugs.append(context["message"]))
+
+        def fail(_: str) -> None:
+            raise ZeroDivisionError
+
+        lost: list[str] = []
+        bus = Bus()
+        links = [
+            bus.open(LinkSettings(4 + at), on_lost=on_lost) for at, on_lost in enumerate((fail, lost.append))
+        ]
+        for link in links:
+            link.send(ask(1))
+        out = ffi.new("uint8_t[]", lib.IO_OUT_FRAMES * FRAME.size)
+        driver = bus.driver
+        for _ in range(ENDLESS):
+            while lib.io_next(driver.bus, driver.now, 0, out, len(out)):
+                pass
+            driver.now += 50_000_000
+            lib.io_handle_time(driver.bus, driver.now)
+        driver.hand_over()
+        assert len(lost) == 1
+        assert bugs == ["by hand: a notice could not be handled; this is reported once"]
+
+    asyncio.run(test())
+
+
 def test_who_waits_for_a_drained_link_is_told_when_the_transport_ends() -> None:
     async def test() -> None:
         bus = Bus()
