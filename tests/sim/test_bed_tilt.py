@@ -112,6 +112,13 @@ def test_it_is_found_by_hand_with_the_tilt_of_before(tmp_path: Path) -> None:
         ),
         ({"x_adjust": 0.2}, "", "x_adjust"),
         ({"points": "1, 2\n  3, 4"}, "", "3 or more places"),
+        # Failed before: the motors went 74.8 mm below position_min.
+        (
+            {"x_adjust": 0.1, "z_adjust": -100},
+            "",
+            r"\[bed_tilt\]: the tilt is refused: .* Z 100\.0 mm beyond",
+        ),
+        ({"y_adjust": 0.03}, "", r"would drive Z 6\.0 mm beyond position_min or position_max"),
     ],
 )
 def test_what_cannot_be_is_refused(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from coordinator.config.options import SectionSpec
+from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.gcode.builtins.machine import follow_surface
 from coordinator.gcode.commands import (
     Call,
@@ -144,17 +145,28 @@ class BedMesh(Module):
 
     # ------------------------------------------------------------------------------------------- following
 
-    def take(self, job: ProgramContext, mesh: Mesh | None, profile: str = "") -> bool:
-        """Let Z follow MESH from here on; no motor moves. False: the planner has to be emptied first."""
+    def take(
+        self,
+        job: ProgramContext,
+        mesh: Mesh | None,
+        profile: str = "",
+        offsets: tuple[Place, float] | None = None,
+    ) -> bool:
+        """Let Z follow MESH from here on; no motor moves. False: the planner has to be emptied first.
+
+        OFFSETS: where it is looked up, and of its fade; None: as before. Raises WordError.
+        """
+        offset, fade_offset = offsets or (self._offset, self._fade_offset)
         surface = None
         if mesh is not None:
             assert self._settings is not None
             try:
-                surface = mesh.surface(self._settings.fade.of(mesh, self._fade_offset), self._offset)
+                surface = mesh.surface(self._settings.fade.of(mesh, fade_offset), offset)
             except CanductorError as error:
                 raise WordError(str(error)) from None
         if not follow_surface(job, surface):
             return False
+        self._offset, self._fade_offset = offset, fade_offset
         self._mesh, self._profile, self._surface = mesh, profile, surface
         self._fine = [[]] if mesh is None else _rows(mesh.fine_heights())
         if surface is not None:
@@ -251,11 +263,7 @@ class BedMesh(Module):
         except (KeyError, IndexError, TypeError, ValueError):
             raise WordError("the mesh that was followed cannot be read") from None
 
-        def act(job: ProgramContext) -> bool:
-            self._offset, self._fade_offset = offset, fade_offset
-            return self.take(job, mesh, profile)
-
-        return ProgramAction(act)
+        return ProgramAction(lambda job: self.take(job, mesh, profile, (offset, fade_offset)))
 
     # ----------------------------------------------------------------------------------------- calibrating
 
@@ -379,16 +387,18 @@ class BedMesh(Module):
 
     def _read_offset(self, call: Call) -> Reading:
         given = call.parameters("X", "Y", "ZFADE")
-        x, y, fade = (value(call.command, given, key, 0.0) for key in ("X", "Y", "ZFADE"))
+        x, y, fade = (
+            bounded(call.command, given, key, 0.0, low=-MAX_POSITION, high=MAX_POSITION)
+            for key in ("X", "Y", "ZFADE")
+        )
 
         def act(job: ProgramContext) -> bool:
-            before = (self._offset, self._fade_offset)
-            self._offset = (x if "X" in given else before[0][0], y if "Y" in given else before[0][1])
-            self._fade_offset = fade if "ZFADE" in given else before[1]
-            taken = self._mesh is None or self.take(job, self._mesh, self._profile)
-            if not taken:
-                self._offset, self._fade_offset = before
-            return taken
+            offset = (x if "X" in given else self._offset[0], y if "Y" in given else self._offset[1])
+            fade_offset = fade if "ZFADE" in given else self._fade_offset
+            if self._mesh is not None:
+                return self.take(job, self._mesh, self._profile, (offset, fade_offset))
+            self._offset, self._fade_offset = offset, fade_offset
+            return True
 
         return ProgramAction(act)
 

@@ -12,6 +12,7 @@ from coordinator.gcode.parser import WordError
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.compensation.bed_mesh import BedMesh
+from coordinator.modules.compensation.reach import beyond_range
 from coordinator.modules.levelling.points import OPTIONS, PlacesOption, ProbePoints, how_to_measure
 from coordinator.modules.levelling.surfaces import Plane, fit_plane
 from coordinator.modules.probes.probe import Measured, Probe
@@ -74,7 +75,9 @@ class Tilt:
         return cls(plane.slope_x, plane.slope_y, plane.height((0.0, 0.0)))
 
     def surface(self, limits: MotionLimits) -> Surface:
-        """Return it as far as LIMITS let the head go; raises StepError where it is too steep."""
+        """Return it as far as LIMITS let the head go; raises StepError where it is too steep or high."""
+        if wrong := beyond_range(limits, lambda at: (*at[:2], at[2] + self.height(*at[:2]))):
+            raise StepError(f"the tilt is refused: {wrong}; correct position_endstop of Z first")
         low, high = limits.position_min[:2], limits.position_max[:2]
         nodes = [
             [(self.height(x, y), self.x, self.y, 0.0) for x in (low[0], high[0])] for y in (low[1], high[1])
@@ -95,7 +98,10 @@ class BedTilt(Module):
         self._points = ProbePoints(build, () if places is None else places)
         self._probe: Probe | None = None
         self._tilt = Tilt(build.get(X_ADJUST), build.get(Y_ADJUST), build.get(Z_ADJUST))
-        build.surface = self._tilt.surface(self._limits)
+        try:
+            build.surface = self._tilt.surface(self._limits)
+        except StepError as error:
+            raise ConfigError(build.place, f"[{self.name}]: {error}") from None
         build.add_command(
             "BED_TILT_CALIBRATE", "Probe the bed and let Z follow its plane", self._read_calibrate
         )

@@ -23,9 +23,10 @@ from coordinator.gcode.commands import (
     Reading,
 )
 from coordinator.gcode.events import Done, PositionSet, WeightsChange
-from coordinator.gcode.parameters import flag, one, value
+from coordinator.gcode.parameters import bounded, flag, one, value
 from coordinator.gcode.parser import Command, WordError, command_line, quoted
 from coordinator.modules.base import Build, Module, Modules
+from coordinator.modules.compensation.reach import beyond_range
 from coordinator.modules.homing.homing import Homing
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
@@ -132,14 +133,20 @@ class Skews(Module):
         return {"current_profile_name": self._profile, **factors}
 
     def take(self, job: ProgramContext, skew: Skew, profile: str = "") -> bool:
-        """Correct SKEW from here on; the head stays. False: the planner has to be emptied first."""
+        """Correct SKEW from here on; the head stays. False: the planner has to be emptied first.
+
+        Raises WordError for one that drives motors too far beyond their range.
+        """
+        planner = job.planner
+        if wrong := beyond_range(planner.limits, lambda at: skew.wanted((*at, 0.0))[:3]):
+            raise WordError(
+                f"the skew is refused: {wrong}; measure both diagonals and the side of the print again"
+            )
         if not come_to_standstill(job):
             return False
-        planner = job.planner
-        driven = self.now.wanted(planner.toolhead_position)
-        self.now, self._profile = skew, profile
-        position = skew.made(driven)
+        position = skew.made(self.now.wanted(planner.toolhead_position))
         planner.set_position(position)
+        self.now, self._profile = skew, profile
         at_s = planner.print_time_end_s
         job.emit(PositionSet(job.line, "", position, at_s))
         follows = {name: skew.weights(straight) for name, straight in self.straight.items()}
@@ -197,7 +204,12 @@ class Skews(Module):
 
     def _restore(self, call: Call) -> Reading:
         given = call.parameters(*_PLANES)
-        skew = Skew(**{plane.lower(): value(call.command, given, plane, 0.0) for plane in _PLANES})
+        skew = Skew(
+            **{
+                plane.lower(): bounded(call.command, given, plane, 0.0, low=-SKEW_MAX, high=SKEW_MAX)
+                for plane in _PLANES
+            }
+        )
         return ProgramAction(lambda job: self.take(job, skew))
 
     def _set(self, call: Call) -> Reading:

@@ -32,7 +32,7 @@ def test_what_is_believed_and_made_are_each_others_inverse() -> None:
         )
 
 
-@pytest.mark.parametrize("tangent", [0.0, 0.01, -0.03])
+@pytest.mark.parametrize("tangent", [0.0, 0.01, -0.02])
 def test_a_measured_square_tells_how_it_leans(tmp_path: Path, tangent: float) -> None:
     machine = ProgramStage(tmp_path, "[skew_correction]\n")
     measured = leaning(140, tangent)
@@ -98,6 +98,25 @@ def test_a_program_makes_so_many_profiles_and_no_more(tmp_path: Path) -> None:
 )
 def test_mistakes_are_told(tmp_path: Path, line: str, sentence: str) -> None:
     assert sentence in ProgramStage(tmp_path, PROFILE).error(line)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("plane", "by_mm"), [("XY", 6.3), ("XZ", 6.6), ("YZ", 6.6)])
+def test_motors_stay_near_their_range(tmp_path: Path, plane: str, by_mm: float, sign: int) -> None:
+    """Failed before: X went to -250 mm with _SET_SKEW XY=1, and to -8 mm with a square measured wrongly."""
+    machine = ProgramStage(tmp_path, "[skew_correction]\n[skew_correction wrong]\nxy_skew: 0.2\n")
+    machine.run("G28", f"SET_SKEW {plane}={leaning(140, sign * 0.02)}")
+    (skews,) = machine.modules.of(Skews)
+    before = skews.now
+    refused = f"at a corner it would drive {plane[0]} {by_mm} mm beyond position_min or position_max"
+    assert refused in machine.error(f"SET_SKEW {plane}={leaning(140, sign * 0.03)}")
+    assert refused in machine.error(f"_SET_SKEW {plane}={sign * 0.03}")
+    assert f"{plane} of _SET_SKEW is {sign * 1e15:g}; -0.2 to 0.2" in machine.error(
+        f"_SET_SKEW {plane}={sign * 1e15}"
+    )
+    assert "would drive X 42.0 mm" in machine.error("SKEW_PROFILE LOAD=wrong")
+    assert skews.now == before
+    assert machine.machine.follows == {name: before.weights(own) for name, own in skews.straight.items()}
 
 
 def test_a_machine_that_is_no_sum_of_axes_is_refused(tmp_path: Path) -> None:
