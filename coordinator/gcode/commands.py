@@ -114,7 +114,8 @@ class Phases:
     """Follow the readings that RUN yields for the program; the next is made when the one before is over.
 
     RUN goes on in the reader's thread and may raise WordError. Where a program is only planned, what is done
-    at standstill never happens: RUN has to end when it finds that nothing came of it.
+    at standstill never happens: RUN has to end when it finds that nothing came of it. A generator is closed
+    when the program ends before it, by an error of what it yielded or because it was cancelled.
     """
 
     run: "Callable[[ProgramContext], Iterator[Reading]]"

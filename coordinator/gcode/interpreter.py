@@ -5,7 +5,7 @@ real-time streamer drive the same ``step`` and act on its events (events.py).
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from coordinator.gcode.absent_commands import ABSENT
@@ -188,6 +188,7 @@ class Job(ProgramContext):
                     self._advance()
             except GCodeError as error:
                 self._over = error
+                self.close()
         return self._events.popleft()
 
     @property
@@ -218,8 +219,16 @@ class Job(ProgramContext):
                 self._take_result(self._action)
             except GCodeError as error:
                 self._over = error
+                self.close()
                 raise
         return self._events.popleft() if self._events else None
+
+    def close(self) -> None:
+        """End the phases of commands that it does not go on with, after an error or before its end."""
+        while self._inner:
+            inner = self._inner.pop()
+            if isinstance(inner, _Phase) and isinstance(inner.readings, Generator):
+                inner.readings.close()
 
     def _progress(self) -> Progress:
         return Progress(self.planner.lines, self.program.done_bytes, self.program.size_bytes)

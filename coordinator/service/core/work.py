@@ -114,8 +114,10 @@ class Work(ABC):
         """Return how far it is read."""
         return NO_PROGRESS
 
-    def close(self) -> None:  # noqa: B027 (most works hold nothing)
+    def close(self) -> None:
         """Release what it holds."""
+        if self._job is not None:
+            self._job.close()
 
 
 class _Text:
@@ -187,6 +189,7 @@ class FileWork(Work):
     def close(self) -> None:
         """Close the file; the modes of what follows are not this job's, nor is its tower."""
         if self._job is not None:
+            self._job.close()
             self._job.planner.reset_modes()
             self._job.machine.tower = None
             self._job.planner.watch_height(None)

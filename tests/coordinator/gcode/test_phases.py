@@ -20,9 +20,12 @@ from coordinator.gcode.commands import (
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import Done, End, Event, Full, Reply, StandstillAction
 from coordinator.gcode.interpreter import Job
+from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import Planner
+from coordinator.service.core.feeder import Feeder
+from coordinator.service.core.work import LinesWork
 from tests.coordinator.motion.planner_helpers import LIMITS, drain
 
 HOME = {"X": 0.0, "Y": 0.0, "Z": 0.0}
@@ -115,3 +118,61 @@ def test_a_command_that_calls_itself_is_refused() -> None:
     work = job(Again(), "PROBE")
     with pytest.raises(GCodeError, match=r"PROBE calls itself"):
         replies(work, Again(), ())
+
+
+class Tidy(Probing):
+    """Notes when its end has come, whatever the end is."""
+
+    def __init__(self, *rest: Reading) -> None:
+        super().__init__()
+        self.rest = rest
+        self.ended = False
+
+    def run(self, job: ProgramContext, call: Call) -> Iterator[Reading]:
+        del job, call
+        try:
+            yield AtStandstill(nothing)
+            yield from self.rest
+        finally:
+            self.ended = True
+
+
+def fail(job: ProgramContext) -> bool:
+    del job
+    raise WordError("X is outside")
+
+
+@pytest.mark.parametrize("reading", [ProgramAction(fail), Lines("G28 X1 Y=")])
+def test_they_end_with_the_error_of_what_they_yield(reading: Reading) -> None:
+    """Failed before: they ended when the program was forgotten, which may be much later."""
+    tidy = Tidy(reading)
+    work = job(tidy, "G28", "PROBE")
+    with pytest.raises(GCodeError):
+        replies(work, tidy, (1.0,))
+    assert tidy.ended
+
+
+def test_they_end_with_what_fails_at_standstill() -> None:
+    tidy = Tidy()
+    work = job(tidy, "G28", "PROBE")
+    while not isinstance(event := work.step(), StandstillAction):
+        drain(work.planner)
+    event.over, event.failure = True, "no trigger"
+    with pytest.raises(GCodeError, match="no trigger"):
+        work.step()
+    assert tidy.ended
+
+
+def test_they_end_with_the_work_that_is_cancelled() -> None:
+    tidy = Tidy()
+    commands = {"PROBE": GCodeCommand("PROBE", "for the test", tidy.read)}
+    feeder = Feeder(Planner(LIMITS), HOME, MachineState(), Vocabulary(commands))
+    queued = feeder.submit(LinesWork(["PROBE"]))
+    while not isinstance(feeder.step(), StandstillAction):
+        drain(feeder.planner)
+    assert not tidy.ended
+    feeder.cancel(queued)
+    while not feeder.finished:
+        feeder.step()
+        drain(feeder.planner)
+    assert tidy.ended
