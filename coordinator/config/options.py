@@ -28,6 +28,14 @@ class BadValue(ValueError):  # noqa: N818 (the answer of a parser, not a failure
     """The text is no value of the option; the argument says why where the rule alone does not."""
 
 
+def parse_decimal(text: str) -> float:
+    """Return the number TEXT, white space around it aside, neither infinite nor NaN; raises BadValue."""
+    value = read_decimal(text.strip())
+    if value is None:
+        raise BadValue
+    return value
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option(Generic[T]):
     """One option of a section."""
@@ -108,9 +116,7 @@ class FloatOption(_Bounded[float]):
 
     def parse(self, text: str) -> float:
         """Return the number; neither infinite nor NaN."""
-        value = read_decimal(text)
-        if value is None:
-            raise BadValue
+        value = parse_decimal(text)
         self._check(value)
         return value
 

@@ -217,6 +217,7 @@ def test_a_force_beyond_the_limit_ends_the_way_down(tmp_path: Path) -> None:
         ({"drift_filter_cutoff_frequency": 50}, "a filter can only be for frequencies below 40 Hz"),
         ({"notch_filter_frequencies": "50"}, "a filter can only be for frequencies below 40 Hz"),
         ({"notch_filter_frequencies": "1, many"}, "must be a number of Hz"),
+        ({"notch_filter_frequencies": "1, 1_0"}, "must be a number of Hz"),
         ({"notch_filter_frequencies": "1, 2, 3, 4, 5"}, "more than 4"),
         ({"drift_filter_delay": 3}, "drift_filter_delay"),
         ({"trigger_force": 300, "force_safety_limit": 250}, "it has to be below force_safety_limit"),

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from coordinator.config.options import BadValue, Option
+from coordinator.config.options import BadValue, Option, parse_decimal
 from coordinator.support.lazy_numpy import Numbers, np
 
 HEIGHTS: Final = (0.1, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
@@ -91,7 +91,5 @@ class DriftOption(Option[CoilDrift]):
 
 def _curve(line: str) -> tuple[float, tuple[float, float, float]]:
     height, _, words = line.partition(":")
-    a, b, c = (float(word) for word in words.split(","))
-    if not np.all(np.isfinite((float(height), a, b, c))):
-        raise ValueError
-    return float(height), (a, b, c)
+    a, b, c = (parse_decimal(word) for word in words.split(","))
+    return parse_decimal(height), (a, b, c)

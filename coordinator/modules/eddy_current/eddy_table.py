@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from coordinator.config.options import BadValue, Option
+from coordinator.config.options import BadValue, Option, parse_decimal
 from coordinator.support.lazy_numpy import np
 from nodes.support.errors import CanductorError
 
@@ -71,7 +71,7 @@ class TableOption(Option[EddyTable]):
         """Return it."""
         try:
             pairs = [word.split(":") for word in text.replace("\n", " ").split(",") if word.strip()]
-            return table_of([(float(height), float(frequency)) for height, frequency in pairs])
+            return table_of([(parse_decimal(mm), parse_decimal(hz)) for mm, hz in pairs])
         except ValueError:
             raise BadValue from None
 

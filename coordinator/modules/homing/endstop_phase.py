@@ -26,6 +26,7 @@ from coordinator.modules.homing.homing_plan import AXES
 from coordinator.runtime.moves.homing import HomingError, HomingResult
 from coordinator.support.quoting import nearest_or_all
 from coordinator.support.values import Value
+from nodes.support.numbers import read_int
 
 FULL_STEPS: Final = 4
 """Of a cycle. Both coils have the same current there: with a driver's MSCNT in the middle of each quarter."""
@@ -38,13 +39,10 @@ class PhaseOption(Option[tuple[int, int]]):
 
     def parse(self, text: str) -> tuple[int, int]:
         """Return both."""
-        phase, slash, phases = text.partition("/")
-        if not slash or not phase.strip().isdecimal() or not phases.strip().isdecimal():
+        phase, phases = (read_int(word.strip()) for word in text.partition("/")[::2])
+        if phase is None or phases is None or not 0 <= phase < phases <= MSCNT_CYCLE:
             raise BadValue
-        found = int(phase), int(phases)
-        if not 0 <= found[0] < found[1] <= MSCNT_CYCLE:
-            raise BadValue
-        return found
+        return phase, phases
 
     def rule(self) -> str:
         """Return what is allowed."""

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.file import RawOption
-from coordinator.config.options import BadValue, FloatOption, Option, SectionSpec, TextOption
+from coordinator.config.options import BadValue, FloatOption, Option, SectionSpec, TextOption, parse_decimal
 from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.gcode.commands import Call, Immediate, Phases, ProgramContext, Reading
 from coordinator.gcode.parameters import bounded
@@ -280,10 +280,7 @@ class DeltaCalibrate(Module):
 
 def _numbers(text: str, count: int) -> tuple[float, ...]:
     """Return COUNT numbers with commas between them; raises BadValue."""
-    try:
-        found = tuple(float(word) for word in text.split(","))
-    except ValueError:
-        raise BadValue from None
-    if len(found) != count or not all(math.isfinite(number) for number in found):
+    found = tuple(parse_decimal(word) for word in text.split(","))
+    if len(found) != count:
         raise BadValue
     return found

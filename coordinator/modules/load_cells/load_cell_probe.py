@@ -11,7 +11,15 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
 from typing import Any, ClassVar, Final
 
-from coordinator.config.options import FloatOption, IntOption, ListOption, Option, SectionSpec
+from coordinator.config.options import (
+    BadValue,
+    FloatOption,
+    IntOption,
+    ListOption,
+    Option,
+    SectionSpec,
+    parse_decimal,
+)
 from coordinator.config.pins import PinOption
 from coordinator.config.sections.bounds import MAX_SPEED
 from coordinator.config.sections.probe import LOAD_CELL, OFFSETS, Z_OFFSET
@@ -377,8 +385,8 @@ def _hums(build: Build, rate: int) -> tuple[float, ...]:
     found = []
     for word in build.get_or(NOTCHES, ()):
         try:
-            found.append(float(word))
-        except ValueError:
+            found.append(parse_decimal(word))
+        except BadValue:
             raise build.reader.bad(NOTCHES, "of which each must be a number of Hz") from None
         _check(build, NOTCHES, found[-1], rate)
     if len(found) > NOTCHES_MAX:
