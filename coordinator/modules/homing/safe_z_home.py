@@ -6,7 +6,7 @@ from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
-from coordinator.config.sections.bounds import speed_option
+from coordinator.config.sections.bounds import MAX_POSITION, speed_option
 from coordinator.gcode.commands import AtStandstill, Call, Phases, Position, ProgramContext, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
@@ -14,8 +14,6 @@ from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import Homing
 from coordinator.runtime.moves.straight import move_by
 from nodes.support.errors import CanductorError
-
-HOP_MAX_MM: Final = 1000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,11 +41,12 @@ PLACE: Final = PlaceOption(name="home_xy_position", help="position of the head w
 SPEED: Final = speed_option("speed", "of the way there", 50.0)
 Z_HOP: Final = FloatOption(
     name="z_hop",
-    help="how far the head is lifted before any axis is homed, and its height afterwards; 0: not at all",
+    help="how far the head is lifted before any axis is homed, and its height afterwards, at most"
+    " position_max of Z; 0: not at all",
     default=0.0,
     unit="mm",
     minimum=0,
-    maximum=HOP_MAX_MM,
+    maximum=MAX_POSITION,
 )
 Z_HOP_SPEED: Final = speed_option("z_hop_speed", "of the lift", 15.0)
 BACK: Final = BoolOption(
@@ -72,6 +71,9 @@ class SafeZHome(Module):
         self._speed, self._hop_speed = build.get(SPEED), build.get(Z_HOP_SPEED)
         self._hop_mm, self._back = build.get(Z_HOP), build.get(BACK)
         self._limits = build.machine.limits
+        top_mm = self._limits.position_max[2]
+        if self._hop_mm > top_mm:
+            raise build.reader.bad(Z_HOP, f"but Z goes up to {top_mm:g} mm")
         kinematics = build.machine.kinematics
         if not kinematics.straight:
             raise ConfigError(

@@ -192,6 +192,13 @@ def test_it_has_no_use_where_the_head_cannot_be_moved_before_it_is_known(tmp_pat
         load_machine(write(tmp_path, text))
 
 
+def test_a_hop_does_not_lead_beyond_the_end_of_z(tmp_path: Path) -> None:
+    """Failed before: the head was moved as far as z_hop says, whatever Z has."""
+    load_machine(write(tmp_path, SWITCHES_CFG + SAFE + "z_hop: 250\n"))
+    with pytest.raises(ConfigError, match=r"'z_hop' of \[safe_z_home\] is '250.5', but Z goes up to 250 mm$"):
+        load_machine(write(tmp_path, SWITCHES_CFG + SAFE + "z_hop: 250.5\n"))
+
+
 @pytest.mark.parametrize(
     ("options", "wrong"),
     [
@@ -199,7 +206,6 @@ def test_it_has_no_use_where_the_head_cannot_be_moved_before_it_is_known(tmp_pat
         ("home_xy_position: 1, 2, 3\n", "home_xy_position"),
         ("home_xy_position: 100000.5, 0\n", "home_xy_position"),
         ("home_xy_position: 0, -100000.5\n", "home_xy_position"),
-        ("home_xy_position: 1, 2\nz_hop: 1000.5\n", "z_hop"),
         ("home_xy_position: 1, 2\nz_hop: -0.1\n", "z_hop"),
         ("home_xy_position: 1, 2\nspeed: 0\n", "speed"),
         ("home_xy_position: 1, 2\nz_hop_speed: 0\n", "z_hop_speed"),
@@ -214,7 +220,7 @@ def test_a_place_is_explained_and_has_a_stand_in(stager: Stager) -> None:
     (place, *_) = SafeZHome.SPEC.options
     assert place.rule() == "X and Y in mm with a comma between them, as in 100, 100"
     assert place.stand_in() == (0.0, 0.0)
-    (safe,) = stager(SAFE + "z_hop: 1000\n").modules.of(SafeZHome)
+    (safe,) = stager(SAFE + "z_hop: 250\n").modules.of(SafeZHome)
     assert safe.name == "safe_z_home"
     assert safe._outside == ""
 
