@@ -11,10 +11,10 @@ from typing import Any, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec, TextOption
+from coordinator.config.text import split_lines
 from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parameters import needed
 from coordinator.gcode.parser import WordError, quoted
-from coordinator.gcode.script_lines import script_lines
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
 from coordinator.support.file_writer import FileWriter
@@ -121,19 +121,19 @@ def read_variables(path: Path) -> dict[str, Any]:
 def _variables_in(path: Path, data: bytes) -> dict[str, Any]:
     """Return the values in DATA, the content of the file PATH; raises CanductorError."""
     found: dict[str, Any] = {}
-    for number, line in enumerate(script_lines(data.decode("utf-8", "replace")), 1):
+    for number, line in enumerate(split_lines(data, str(path)), 1):
         text = line.strip()
         if not text or text.startswith(("#", ";", "[")):
             continue
         name, equals, value = text.partition("=")
+        if not equals:
+            raise CanductorError(f"{path}:{number}: there is no = in this line; correct or remove it")
         try:
             found[name.strip().lower()] = literal(value.strip())
         except ValueError as problem:
             raise CanductorError(
                 f"{path}:{number}: the value {problem}; correct or remove the line"
             ) from None
-        if not equals:
-            raise CanductorError(f"{path}:{number}: there is no = in this line; correct or remove it")
     return found
 
 

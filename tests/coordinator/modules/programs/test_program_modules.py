@@ -130,6 +130,12 @@ def test_a_plan_keeps_variables_to_itself(tmp_path: Path) -> None:
     assert read_variables(tmp_path / "kept.cfg")["x"] == 1.5
 
 
+def test_a_file_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    """Failed before: the start was refused, for a value of '' in line 1."""
+    (tmp_path / "kept.cfg").write_text("[Variables]\nx = 'é'\n", encoding="utf-8-sig")
+    assert read_variables(tmp_path / "kept.cfg") == {"x": "é"}
+
+
 @pytest.mark.parametrize(("section", "option"), [("save_variables", "filename"), ("virtual_sdcard", "path")])
 def test_a_path_below_a_home_that_does_not_exist(tmp_path: Path, section: str, option: str) -> None:
     with pytest.raises(ConfigError) as error:
@@ -174,10 +180,17 @@ def test_no_variables_are_kept_that_the_next_start_refuses(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("text", "part"), [("x", "no value"), ("\nx = what", ":2: the value is 'what'"), ("x = 1\ny: 2", ":2: ")]
+    ("text", "part"),
+    [
+        (b"x", ":1: there is no = in this line"),
+        (b"\nx = what", ":2: the value is 'what'"),
+        (b"x = 1\ny: 2", ":2: there is no ="),
+        (b"[Variables]\nx = 'caf\xe9'\n", ":2: byte 0xe9 is not UTF-8 text; save the file as UTF-8"),
+    ],
 )
-def test_a_file_that_is_spoilt_is_told(tmp_path: Path, text: str, part: str) -> None:
-    (tmp_path / "kept.cfg").write_text(text, encoding="utf-8")
+def test_a_file_that_is_spoilt_is_told(tmp_path: Path, text: bytes, part: str) -> None:
+    """Failed before: what is no UTF-8 was read as another text, which the next SAVE_VARIABLE wrote."""
+    (tmp_path / "kept.cfg").write_bytes(text)
     with pytest.raises(ConfigError) as error:
         variables(tmp_path)
     assert part in str(error.value)
