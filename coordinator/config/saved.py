@@ -5,7 +5,6 @@ The file is replaced in one step or not at all, and what the user wrote stays as
 
 import codecs
 import errno
-import os
 import re
 import stat
 from collections.abc import Callable, Mapping
@@ -16,7 +15,7 @@ from typing import Final
 from coordinator.config.errors import ConfigError
 from coordinator.config.file import SAVED_HEADER, SAVED_PREFIX, parse_saved, saved_header
 from coordinator.config.text import split_lines
-from coordinator.support.atomic_file import atomic_write
+from coordinator.support.atomic_file import replace_content
 from coordinator.support.quoting import shown, shown_path
 from nodes.support.errors import CanductorError
 
@@ -227,17 +226,14 @@ def replace_file(path: str, before: bytes, after: bytes) -> None:
     Its mode stays; of a symbolic link the file that it leads to is replaced.
     """
     try:
-        real = Path(path).resolve(strict=True)
-        status = real.stat()
+        file = Path(path)
         # AFTER: an earlier attempt failed when all but its last step was done.
-        if not stat.S_ISREG(status.st_mode) or real.read_bytes() not in (before, after):
+        if not stat.S_ISREG(file.stat().st_mode) or file.read_bytes() not in (before, after):
             raise SaveError(
                 f"{shown_path(path)} has changed since it was read, so nothing was saved; RESTART reads it"
                 " again, then calibrate again"
             )
-        if not os.access(real, os.W_OK):
-            raise PermissionError(13, "it is write-protected")
-        atomic_write(real, after, like=status)
+        replace_content(file, after)
     except OSError as error:
         way_out = _WAYS_OUT.get(error.errno or 0, "make the file and its folder writable")
         raise SaveError(f"cannot write {shown_path(path)}: {error.strerror or error}; {way_out}") from None

@@ -1,6 +1,7 @@
 """Files that are written whole or not at all."""
 
 import contextlib
+import errno
 import fcntl
 import os
 import stat
@@ -35,6 +36,20 @@ def atomic_write(path: Path, data: bytes, *, like: os.stat_result | None = None)
             Path(name).unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def replace_content(path: Path, data: bytes) -> None:
+    """Do as ``atomic_write``, and let a file that exists be as it was: its mode, its owner, links to it.
+
+    Of a symbolic link the file that it leads to is replaced. Raises OSError, also for a write-protected file.
+    """
+    try:
+        like = path.stat()
+    except FileNotFoundError:
+        like = None
+    if like is not None and not os.access(path, os.W_OK):
+        raise PermissionError(errno.EACCES, "it is write-protected")
+    atomic_write(path.resolve(), data, like=like)
 
 
 def sync_folder(path: Path) -> None:

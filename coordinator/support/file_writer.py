@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from coordinator.support.atomic_file import atomic_write
+from coordinator.support.atomic_file import replace_content
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +47,7 @@ class FileWriter:
         while (newest := self._newer(path, content)) is not None:
             content = newest
             try:
-                atomic_write(path, content.data)
+                replace_content(path, content.data)
             except OSError as error:
                 content.on_failure(error)
 

@@ -1,5 +1,6 @@
-"""A disk that takes nothing while a machine runs, and sections whose names have blanks; virtual time."""
+"""Files that a machine writes while it runs, disks that take nothing, names with blanks; virtual time."""
 
+import stat
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from coordinator.modules.programs.save_variables import read_variables
 from coordinator.service.core.machine_service import WRITE_S
 from coordinator.support import file_writer
-from coordinator.support.atomic_file import atomic_write
+from coordinator.support.atomic_file import replace_content
 from coordinator.support.file_writer import FileWriter
 from tests.stages.demo_machine import DemoMachine
 from tests.stages.served import Served
@@ -52,9 +53,9 @@ def answers(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
 
     def write(path: Path, data: bytes) -> None:
         event.wait()
-        atomic_write(path, data)
+        replace_content(path, data)
 
-    monkeypatch.setattr(file_writer, "atomic_write", write)
+    monkeypatch.setattr(file_writer, "replace_content", write)
     yield event
     event.set()
 
@@ -107,3 +108,20 @@ def test_a_disk_that_does_not_answer_keeps_no_service_from_ending(
     assert not answers.is_set()
     assert waits == [WRITE_S]
     assert lines[-1] == "the disk has not answered for 10 s; what was saved last may be lost"
+
+
+def test_variables_are_written_where_a_link_leads_and_the_mode_stays(tmp_path: Path) -> None:
+    """Failed before: the link became a file with mode 0600, and the one it led to kept the old values."""
+    real, link = tmp_path / "real.cfg", tmp_path / "link.cfg"
+    real.write_text("[Variables]\na = 1\n", encoding="utf-8")
+    real.chmod(0o644)
+    link.symlink_to("real.cfg")
+
+    async def main(stage: Served) -> None:
+        await stage.until_state("ready")
+        await stage.call("gcode.run", script="SAVE_VARIABLE VARIABLE=b VALUE=2")
+
+    DemoMachine(tmp_path, sections=f"\n[save_variables]\nfilename: {link}\n").serve(main)
+    assert real.read_text(encoding="utf-8") == "[Variables]\na = 1\nb = 2\n"
+    assert stat.S_IMODE(real.stat().st_mode) == 0o644
+    assert link.is_symlink()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.support import file_writer
-from coordinator.support.atomic_file import atomic_write
+from coordinator.support.atomic_file import replace_content
 from coordinator.support.file_writer import FileWriter
 
 PATIENCE_S = 60.0
@@ -25,13 +25,13 @@ class Disk:
         self.asked.release()
         assert self.answers.wait(PATIENCE_S)
         self.written.append(data)
-        atomic_write(path, data)
+        replace_content(path, data)
 
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Disk]:
     disk = Disk()
-    monkeypatch.setattr(file_writer, "atomic_write", disk.write)
+    monkeypatch.setattr(file_writer, "replace_content", disk.write)
     yield disk
     disk.answers.set()
 
