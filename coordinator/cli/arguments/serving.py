@@ -4,7 +4,7 @@ import argparse
 import re
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from coordinator.front_ends.serve import ServeOptions
 from coordinator.support.examples import machine_name
@@ -17,7 +17,12 @@ _LABEL: Final = re.compile(r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?", re.ASCII)
 
 def declare_serving(command: argparse.ArgumentParser) -> None:
     """Add the options to COMMAND."""
-    add = command.add_argument_group("serving front ends").add_argument
+    group = command.add_argument_group("serving front ends")
+    actions: list[argparse.Action] = []
+
+    def add(*names: str, **how: Any) -> None:
+        actions.append(group.add_argument(*names, **how))
+
     add(
         "--ipc",
         dest="path",
@@ -93,6 +98,7 @@ def declare_serving(command: argparse.ArgumentParser) -> None:
         action="store_true",
         help="let other computers read the metrics, without authentication",
     )
+    command.set_defaults(serving=tuple(actions))
 
 
 def is_asked_to_serve(given: argparse.Namespace) -> bool:
@@ -101,6 +107,13 @@ def is_asked_to_serve(given: argparse.Namespace) -> bool:
         address is not None
         for address in (given.path, given.klippy_api, given.pty, given.tcp, given.web, given.metrics)
     )
+
+
+def refuse_serving_options(given: argparse.Namespace, remedy: str) -> None:
+    """Raise UsageError where an option is given, since nothing is served; REMEDY ends its sentence."""
+    for action in given.serving:
+        if getattr(given, action.dest) != action.default:
+            raise UsageError(f"{'/'.join(action.option_strings)} is for a service; {remedy}, or leave it out")
 
 
 def serving_options(given: argparse.Namespace, config: Path, announce: bool | None = None) -> ServeOptions:

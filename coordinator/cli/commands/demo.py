@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from coordinator.cli.arguments.serving import declare_serving, serving_options
+from coordinator.cli.arguments.serving import declare_serving, refuse_serving_options, serving_options
 from coordinator.demo.run import DemoOptions, run_demo
 from coordinator.demo.serve import serve_demo
 from coordinator.support.examples import DEMO_GCODE, DEMO_MACHINE, find_machine
@@ -85,8 +85,10 @@ def _declare(command: argparse.ArgumentParser) -> None:
 def _run(given: argparse.Namespace) -> Report:
     if given.serve and given.gcode is not None:
         raise UsageError("--serve does not print by itself; leave out --gcode or --serve")
-    if given.web is not None and (given.no_web or not given.serve):
-        raise UsageError("--web shows the machine that --serve keeps running; give --serve, and no --no-web")
+    if given.web is not None and given.no_web:
+        raise UsageError("--web and --no-web exclude each other; leave one out")
+    if not given.serve:
+        refuse_serving_options(given, "give --serve")
     if given.socketcan and given.loss:
         raise UsageError(
             "--loss is for virtual buses; to lose frames of an interface, use 'tc qdisc add dev INTERFACE"

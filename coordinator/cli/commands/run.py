@@ -9,7 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from coordinator.assembly.load import load_machine
-from coordinator.cli.arguments.serving import declare_serving, is_asked_to_serve, serving_options
+from coordinator.cli.arguments.serving import (
+    declare_serving,
+    is_asked_to_serve,
+    refuse_serving_options,
+    serving_options,
+)
 from coordinator.config.model import MachineDescription
 from coordinator.front_ends.outputs import is_behind, outputs_in_threads
 from coordinator.front_ends.serve import serve_machine
@@ -60,6 +65,7 @@ def _run(given: argparse.Namespace) -> Report:
         raise UsageError("--gcode prints a file and exits; leave it out to serve front ends")
     if asked or (given.gcode is None and sys.stdin is not None and sys.stdin.isatty()):
         return serve_machine(serving_options(given, given.config))
+    refuse_serving_options(given, "give --ipc, --klippy-api, --pty, --tcp, --web or --metrics")
     return run_machine(options_from(RunOptions, given))
 
 

@@ -1,5 +1,6 @@
 """The options that serve a machine: what is reachable from other computers needs protection."""
 
+import io
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,45 @@ def test_names_are_of_the_page(capsys: pytest.CaptureFixture[str]) -> None:
 def test_without_serve_there_is_no_page(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["demo", "--web", "8080"]) != 0
     assert "give --serve" in capsys.readouterr().err
+
+
+SERVICE = {
+    ("--log-file", "log"): "--log-file",
+    ("--name", "x y"): "--name",
+    ("--jobs", "."): "--jobs",
+    ("--tokens", "t", "--announce"): "--tokens",
+    ("--no-announce",): "--announce/--no-announce",
+    ("--node-commands",): "--node-commands",
+    ("--web-name", "printer.example"): "--web-name",
+    ("--metrics-open",): "--metrics-open",
+}
+
+
+ADDRESSES = "give --ipc, --klippy-api, --pty, --tcp, --web or --metrics"
+
+
+@pytest.mark.parametrize("words", SERVICE)
+@pytest.mark.parametrize(
+    ("command", "remedy"),
+    [
+        (("run", DEMO_MACHINE), ADDRESSES),
+        (("run", DEMO_MACHINE, "--gcode", DEMO_GCODE), ADDRESSES),
+        (("demo",), "give --serve"),
+    ],
+    ids=["run", "print", "demo"],
+)
+def test_where_nothing_is_served_there_is_nothing_for_a_service(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    command: tuple[object, ...],
+    remedy: str,
+) -> None:
+    """Failed before: they were ignored, and without a terminal nothing was an empty program."""
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    assert cli.main([*map(str, command), *words]) == cli.EXIT_USAGE
+    sentence = f"{SERVICE[words]} is for a service; {remedy}, or leave it out"
+    assert sentence in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
