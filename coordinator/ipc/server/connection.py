@@ -26,15 +26,20 @@ HANG_UP_CHECK_S: Final = 0.5
 
 
 class Connection(asyncio.BufferedProtocol):
-    """A client; ADMIT makes its session once it is there, ON_GONE is called when it has left."""
+    """A client; ADMIT makes its session once it is there, ON_LOST is called when it has left.
+
+    ON_GONE is called behind that, once no stop can be in what it had sent.
+    """
 
     def __init__(
         self,
         admit: Callable[[asyncio.Transport, "Connection"], Session],
+        on_lost: Callable[["Connection"], None],
         on_gone: Callable[["Connection"], None],
         scheduler: FairScheduler,
     ) -> None:
         self._admit = admit
+        self._on_lost = on_lost
         self._on_gone = on_gone
         self._scheduler = scheduler
         self._loop = asyncio.get_running_loop()
@@ -43,6 +48,7 @@ class Connection(asyncio.BufferedProtocol):
         self._linger: asyncio.TimerHandle | None = None
         self._half_closed = False
         self._ended = False
+        self._lost = False
         self.session: Session
         self.transport: asyncio.Transport
 
@@ -105,23 +111,27 @@ class Connection(asyncio.BufferedProtocol):
         self._loop.call_soon(self._request_turn)  # asyncio would end twice what is closed in here
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End everything that still runs for the client; a stop that waits for its turn is done."""
+        """End everything that still runs for the client; a stop that is unread is done in its turn."""
         del exc
-        while (unread := self.session.unread_bytes) and self.session.end_reason is None:
-            for request in self.session.read(self._loop.time()):
-                self._call(request)
-            if self.session.unread_bytes == unread:
-                break
+        self._lost = True
         for handle in (self._timer, self._linger):
             if handle is not None:
                 handle.cancel()
         self._timer = self._linger = None
         for task in self._tasks.values():
             task.cancel()
-        self._scheduler.remove(self)
         if (caller := self.session.caller) is not None:
             for leave in caller.at_end:
                 leave(caller)
+        self._on_lost(self)
+        if self.session.skip_to_stop():
+            self._scheduler.request_turn(self)
+        else:
+            self.forget_rest()
+
+    def forget_rest(self) -> None:
+        """Read no more of what a client has sent that has left."""
+        self._scheduler.remove(self)
         self._on_gone(self)
 
     # ------------------------------------------------------------------------------------------- work
@@ -137,6 +147,8 @@ class Connection(asyncio.BufferedProtocol):
 
     def work(self, until_s: float) -> bool:
         """Do the work there is, at most until UNTIL_S; return whether there is more."""
+        if self._lost:
+            return self._read_rest()
         session, now_s = self.session, self._loop.time()
         for request in session.read(now_s) if session.should_read else ():
             self._call(request)
@@ -154,6 +166,18 @@ class Connection(asyncio.BufferedProtocol):
             self.pause()
         elif not self._half_closed:
             self.transport.resume_reading()
+        return more
+
+    def _read_rest(self) -> bool:
+        """Read on for a client that has left; return whether there is more that may be a stop."""
+        session, before, more = self.session, self.session.unread_bytes, False
+        try:
+            for request in session.read(self._loop.time()):
+                self._call(request)
+            more = session.unread_bytes < before and session.skip_to_stop()
+        finally:
+            if not more:
+                self._on_gone(self)
         return more
 
     def _work_off(self, until_s: float, now_s: float) -> None:

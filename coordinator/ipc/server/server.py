@@ -92,6 +92,8 @@ class IpcServer:
         self._unix: UnixListener | None = None
         self._listener: TcpListener | None = None
         self._connections: set[Connection] = set()
+        self._leaving: dict[Connection, None] = {}
+        """Have left, the first one first: their stops are not read yet. They count against no limit."""
         self._throttle = LoginThrottle()
         self._on_notice = on_notice
         self._tokens: Tokens | None = None
@@ -142,6 +144,8 @@ class IpcServer:
             connection.session.end(EndReason("closing", "the server is closing"))
             connection.flush()
             connection.transport.close()
+        for connection in list(self._leaving):
+            connection.forget_rest()
         await asyncio.sleep(0)
 
     def notify(self, event: str, values: Mapping[str, Value]) -> None:
@@ -164,7 +168,7 @@ class IpcServer:
     def figures(self) -> dict[str, Value]:
         """Return how many clients there are, and the counters of all messages since the start."""
         counted = asdict(self._closed_totals)
-        for connection in self._connections:
+        for connection in (*self._connections, *self._leaving):
             for name, value in asdict(connection.session.counters).items():
                 counted[name] += value
         return {
@@ -178,7 +182,9 @@ class IpcServer:
 
     async def _open_unix(self, path: Path, scheduler: FairScheduler) -> None:
         self._unix = UnixListener(
-            lambda: Connection(self._admit_unix, self._drop, scheduler), self.stop_lane, self._find_stop
+            lambda: Connection(self._admit_unix, self._leave, self._drop, scheduler),
+            self.stop_lane,
+            self._find_stop,
         )
         await self._unix.open(path)
 
@@ -187,7 +193,7 @@ class IpcServer:
         self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
         most = self._settings.tcp_connections_max
         listener = self._listener = TcpListener(
-            lambda: Connection(self._admit_tcp, self._drop, scheduler),
+            lambda: Connection(self._admit_tcp, self._leave, self._drop, scheduler),
             tls,
             handshakes_max=min(HANDSHAKES_MAX, most),
             may_enter=lambda entering: entering + len(self._tcp) < most + REFUSALS_MAX,
@@ -258,7 +264,7 @@ class IpcServer:
             return self._session(connection, address, check)
 
         assert self._scheduler is not None, "the server is not started"
-        connection = Connection(admit, self._drop, self._scheduler)
+        connection = Connection(admit, self._leave, self._drop, self._scheduler)
         connection.connection_made(transport)
         return connection
 
@@ -394,9 +400,17 @@ class IpcServer:
         self._refused += 1
         session.end(fault)
 
-    def _drop(self, connection: Connection) -> None:
+    def _leave(self, connection: Connection) -> None:
         self._connections.discard(connection)
         self._tcp.discard(connection)
+        self._leaving[connection] = None
+        if (
+            len(self._leaving) > self._settings.connections_max
+        ):  # all can leave at once; the first had its turns then
+            next(iter(self._leaving)).forget_rest()
+
+    def _drop(self, connection: Connection) -> None:
+        del self._leaving[connection]
         self._digests.pop(connection, None)
         self.stop_lane.forget(connection)
         for field in fields(SessionCounters):

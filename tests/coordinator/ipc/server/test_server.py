@@ -12,7 +12,7 @@ import pytest
 from coordinator.ipc.protocol.limits import Limits
 from coordinator.ipc.server.connection import UNREAD_BYTES
 from coordinator.ipc.server.fair_scheduler import ROUND_S, TURN_S
-from coordinator.ipc.server.session import PHASES
+from coordinator.ipc.server.session import MESSAGES_PER_TURN, PHASES
 from tests.coordinator.ipc.served import (
     Script,
     Served,
@@ -213,6 +213,65 @@ def test_of_a_client_that_waits_for_its_turn_no_more_than_a_bounded_part_is_take
         assert [answer["id"] for answer in received] == list(range(len(requests)))
 
     run(tmp_path, body, look_s=TURN_S)
+
+
+NO_STOP = b'{"method":"M112 machine.emergency_stop"}\n'
+"""What has to be read to know that it is none."""
+
+
+async def leave_with(served: Served, data: bytes, clients: int, **hello: Any) -> int:
+    """Have CLIENTS send DATA and leave together; return for how many something is still to be read."""
+    scripts = [await served.script(**hello) for _ in range(clients)]
+    for script in scripts:
+        script.writer.write(data)
+        script.writer.close()
+    while served.server._connections:  # noqa: ASYNC110 (there is no event for it)
+        await asyncio.sleep(0)
+    return len(served.server._leaving)
+
+
+def test_what_clients_have_sent_that_leave_together_is_read_in_turns(tmp_path: Path) -> None:
+    """Failed before: all of it in one turn of the loop; 20 clients held it for a second."""
+    data = NO_STOP * 1000 + b'{"method":"machine.emergency_stop"}\n'
+
+    async def body(served: Served) -> None:
+        assert await leave_with(served, data, 8) == 8
+        read, most = int(str(served.server.figures()["requests"])), 0
+        while served.server._leaving:
+            await asyncio.sleep(0)
+            now_read = int(str(served.server.figures()["requests"]))
+            most, read = max(most, now_read - read), now_read
+        assert most <= MESSAGES_PER_TURN * (ROUND_S / TURN_S + 1)
+        assert read == 8 * 1002
+        assert len(served.stops) == 8
+        assert not served.server.stop_lane._unread
+
+    run(tmp_path, body, look_s=TURN_S)
+
+
+@pytest.mark.parametrize(("data", "scope"), [(NO_STOP, "watch"), (b'{"method":""}\n', "admin")])
+def test_what_cannot_be_a_stop_is_not_read_for_one_who_has_left(
+    tmp_path: Path, data: bytes, scope: str
+) -> None:
+    async def body(served: Served) -> None:
+        assert await leave_with(served, data * 1000, 8, scope=scope) == 0
+        assert int(str(served.server.figures()["requests"])) < 4000
+        assert not served.server.stop_lane._unread
+
+    run(tmp_path, body, look_s=TURN_S)
+
+
+def test_who_has_left_takes_nobody_elses_place(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        assert await leave_with(served, NO_STOP * 1500, 3) == 3
+        first = next(iter(served.server._leaving))
+        assert await leave_with(served, NO_STOP * 1500, 3) == 3
+        assert first not in served.server._leaving, "those who left first made room"
+        await served.server.close()
+        assert not served.server._leaving
+        assert not served.server.stop_lane._unread
+
+    run(tmp_path, body, look_s=TURN_S, connections_max=3)
 
 
 @pytest.mark.filterwarnings("error")

@@ -240,6 +240,7 @@ def test_a_client_that_leaves_before_its_turn_has_stopped_the_machine(
         dialled.close()
         while served.server.figures()["connections"]:  # noqa: ASYNC110 (likewise)
             await asyncio.sleep(0)
+        await lane.is_unread_until_done(served.stops)
         assert served.stops == ["me"]
 
     run(tmp_path, go, stop_lane=lane, tcp=over(tmp_path, chosen))
