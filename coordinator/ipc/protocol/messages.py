@@ -112,9 +112,9 @@ class WireReader:
         """Bytes fed and not yet returned as messages."""
         return len(self._buffer)
 
-    def find(self, words: Iterable[bytes]) -> int:
-        """Return where the first of WORDS is in what waits, as a number of bytes; -1: there is none."""
-        found = map(self._buffer.find, words)
+    def find(self, words: Iterable[bytes], since: int = 0) -> int:
+        """Return where in what waits the first of WORDS is that ends behind byte SINCE; -1: there is none."""
+        found = (self._buffer.find(word, max(0, since - len(word) + 1)) for word in words)
         return min((at for at in found if at >= 0), default=-1)
 
     def skip_to(self, at: int) -> None:

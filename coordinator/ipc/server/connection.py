@@ -73,8 +73,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def receive(self, data: bytes | memoryview) -> None:
         """Take DATA."""
-        self.session.receive(data, self._loop.time())
-        self._request_turn()
+        self._request_turn(urgent=self.session.receive(data, self._loop.time()))
 
     def eof_received(self) -> bool:
         """Answer what was requested before the client closed its side; on TCP this counts as leaving."""
@@ -136,9 +135,9 @@ class Connection(asyncio.BufferedProtocol):
 
     # ------------------------------------------------------------------------------------------- work
 
-    def _request_turn(self) -> None:
+    def _request_turn(self, *, urgent: bool = False) -> None:
         if not self.transport.is_closing():
-            self._scheduler.request_turn(self)
+            self._scheduler.request_turn(self, urgent=urgent)
 
     def pause(self) -> None:
         """Read no more until the next turn, if enough is unread."""

@@ -185,9 +185,14 @@ class Session:
         """Bytes that wait for ``take_output``."""
         return self._out_bytes
 
-    def receive(self, data: bytes | memoryview, now_s: float) -> None:
-        """Take DATA that has arrived; ``read`` looks at it."""
+    def receive(self, data: bytes | memoryview, now_s: float) -> bool:
+        """Take DATA that has arrived; ``read`` looks at it. Return whether it seems to be a stop."""
+        before = self._reader.waiting_bytes
         self._reader.feed(data, now_s)
+        if self.caller is None:
+            return False
+        words = self.context.registry.stop_words[self.caller.scope]
+        return bool(words) and self._reader.find(words, before) >= 0
 
     def take_output(self) -> bytes:
         """Return what to send, in order."""

@@ -94,6 +94,40 @@ def test_who_asks_little_is_served_at_once_until_the_round_is_spent() -> None:
     asyncio.run(body())
 
 
+def test_an_urgent_client_is_ahead_and_the_others_get_on() -> None:
+    """Failed before: a stop waited for all who send much. Clients that always seem urgent starve nobody."""
+
+    async def body() -> None:
+        clock, worked = Clock(), list[str]()
+        scheduler = FairScheduler(clock)
+        stop = Client("!", 1, clock, worked)
+        floods = [Client(name, 1000, clock, worked) for name in "ABCDE"]
+        others = [Client(name, 1000, clock, worked) for name in "abc"]
+        for client in (*others, *floods):
+            scheduler.request_turn(client)
+        scheduler.request_turn(stop)
+        scheduler.request_turn(stop, urgent=True)
+        scheduler.request_turn(stop)
+        assert "!" not in worked
+        await asyncio.sleep(0)
+        assert "".join(worked) == "a!abc", "once, before the others"
+        turns = []
+        for _ in range(12):
+            for client in floods:
+                scheduler.request_turn(client, urgent=True)
+            worked.clear()
+            await asyncio.sleep(0)
+            turns.append("".join(worked[TURNS_IN_A_ROUND:]))
+            assert "".join(worked[:TURNS_IN_A_ROUND]).isupper()
+        assert set("".join(turns)) >= set("abc")
+        assert all(turns), "each round has one turn for the others"
+        scheduler.remove(floods[0])
+        await asyncio.sleep(0)
+        assert "A" not in worked[-TURNS_IN_A_ROUND:]
+
+    asyncio.run(body())
+
+
 class BrokenClient(Client):
     def work(self, until_s: float) -> bool:
         super().work(until_s)

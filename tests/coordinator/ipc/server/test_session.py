@@ -91,6 +91,24 @@ def test_a_stop_is_found_where_the_session_would_read_it(
     assert (found is not None) == bool(unread)
 
 
+@pytest.mark.parametrize("encoding", Encoding)
+@pytest.mark.parametrize("message", [STOP, LINES])
+def test_a_stop_seems_to_be_one_when_it_comes(encoding: Encoding, message: dict[str, Any]) -> None:
+    """By whichever bytes complete its word; it costs others their turn, so not for who may not stop."""
+    data = stream(encoding, message)
+    for cut in range(len(data)):
+        session = new_session()
+        assert not session.receive(stream(encoding, HELLO), 0.0)
+        session.read(0.0)
+        seems = [session.receive(part, 0.0) for part in (data[:cut], data[cut:])]
+        assert sum(seems) == 1
+        assert not session.receive(stream(encoding, OTHERS[0]), 0.0)
+    watching = new_session(Scope.WATCH)
+    watching.receive(stream(encoding, HELLO), 0.0)
+    watching.read(0.0)
+    assert not watching.receive(data, 0.0)
+
+
 @pytest.mark.parametrize("written", [rb'"machine.emergency\u005fstop"', rb'"machine.emergency_s\u0074op"'])
 def test_a_stop_is_found_however_its_characters_are_written(written: bytes) -> None:
     assert new_session().find_stop(stream(Encoding.JSON, HELLO) + b'{"method":%b}\n' % written) == "me"
