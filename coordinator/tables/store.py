@@ -59,10 +59,17 @@ class TableStore:
             ) from None
 
     def load(self) -> tuple[dict[str, AxisTable], list[str]]:
-        """Return the tables by axis, and a sentence for each file that is none."""
+        """Return the tables by axis, and a sentence for each file that is none, or for the folder."""
         tables: dict[str, AxisTable] = {}
         problems: list[str] = []
-        for path in sorted(self.folder.glob(f"*{_SUFFIX}")):
+        try:
+            paths = sorted(path for path in self.folder.iterdir() if path.name.endswith(_SUFFIX))
+        except FileNotFoundError:
+            return {}, []
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            return {}, [f"the tables in {self.folder} cannot be read: {reason}"]
+        for path in paths:
             try:
                 table = _read(path)
             except TableError as error:

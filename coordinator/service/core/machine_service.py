@@ -172,6 +172,7 @@ class MachineService:
         Raises JobFolderInUse, before anything is done, when another service has the job folder.
         """
         self.claim_folder()
+        self.tables.read()
         if self.settings.own_process:
             keep_small()
         refresh = asyncio.ensure_future(self._refresh())
@@ -210,6 +211,7 @@ class MachineService:
         Programs have no job control then: nobody could resume. Raises CanductorError; cancelled, or when the
         machine cannot go on, all nodes are stopped.
         """
+        self.tables.read()
         try:
             machine = await self._start(self._load())
             on_ready(machine)

@@ -52,10 +52,13 @@ class TableService:
         self._one_at_a_time = asyncio.Lock()
         self._compensation: Compensation | None = None
         self._description: MachineDescription | None = None
-        if store is not None:
-            self._tables, problems = store.load()
+
+    def read(self) -> None:
+        """Read the kept tables. Not done by the constructor: SAY may need more than there is yet."""
+        if self._store is not None:
+            self._tables, problems = self._store.load()
             for problem in problems:
-                say(problem)
+                self._say(problem)
 
     @property
     def tables(self) -> dict[str, AxisTable]:

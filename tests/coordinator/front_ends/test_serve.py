@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription
 from coordinator.front_ends import serve as front_ends
 from coordinator.front_ends.serve import ServeOptions, serve
 from coordinator.support.examples import DEMO_MACHINE
@@ -78,3 +79,30 @@ def test_a_certificate_that_is_none(options: ServeOptions, tmp_path: Path) -> No
     tokens.touch(mode=0o600)
     asked = replace(options, tcp=("127.0.0.1", 0), tokens=tokens, certificate=pem, private_key=pem)
     assert str(pem) in refusal(asked)
+
+
+class Loaded(BaseException):
+    """Ends a service that has come as far as to load its machine."""
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "sentence"),
+    [
+        ("state/canductor/test/tables/x.table.json", "x.table.json is no kept table and was left out"),
+        ("state/canductor/test/tables", "state/canductor/test/tables cannot be read: not a directory"),
+        ("state/canductor", "state/canductor/test/tables cannot be read: not a directory"),
+    ],
+)
+def test_kept_tables_that_cannot_be_read_are_reported(
+    options: ServeOptions, tmp_path: Path, capfd: pytest.CaptureFixture[str], spoiled: str, sentence: str
+) -> None:
+    """They ended the service as an internal error; so did a state folder that may not be entered."""
+    (tmp_path / spoiled).parent.mkdir(parents=True)
+    (tmp_path / spoiled).touch()
+
+    def load() -> MachineDescription:
+        raise Loaded
+
+    with pytest.raises(Loaded):
+        serve(load, options)
+    assert sentence in capfd.readouterr().out

@@ -318,7 +318,9 @@ def test_a_service_takes_the_kept_tables_that_it_can_use(tmp_path: Path) -> None
 
     def compensation_of(description: MachineDescription) -> Compensation | None:
         machine = Machine(description, LinuxHost(), build_modules(description))
-        return TableService(store, StateTree(), said.append).compensation_of(machine)
+        service = TableService(store, StateTree(), said.append)
+        service.read()
+        return service.compensation_of(machine)
 
     assert compensation_of(plain) is None
     compensation = compensation_of(described)
