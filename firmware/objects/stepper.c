@@ -261,8 +261,7 @@ void command_stepper_stop_on_trigger(struct node *node, const struct wire_arg *a
     if (!trsync)
         return;
     uint32_t irq = board_irq_save(node);
-    stepper->member.stop = member_stop;
-    trsync_join(node, trsync, &stepper->member);
+    trsync_join(node, trsync, &stepper->member, member_stop);
     board_irq_restore(node, irq);
 }
 DECL_COMMAND(command_stepper_stop_on_trigger, "stepper_stop_on_trigger oid=%c trsync_oid=%c", 0);

@@ -25,12 +25,18 @@ struct trsync *trsync_find(struct node *node, uint32_t oid) {
     return oid_find(node, oid, &trsync_type);
 }
 
+static void stop_member(struct node *node, struct trsync_member *member) {
+    void (*stop)(struct node *node, struct trsync_member *member) = member->stop;
+    member->stop = NULL;
+    stop(node, member);
+}
+
 static void stop_members(struct node *node, struct trsync *trsync) {
     struct trsync_member *member = trsync->members;
     trsync->members = NULL;
     while (member) {
         struct trsync_member *next = member->next;
-        member->stop(node, member);
+        stop_member(node, member);
         member = next;
     }
 }
@@ -61,14 +67,16 @@ void trsync_trigger_group(struct node *node, uint8_t group, uint8_t reason) {
             trigger_alone(node, trsync, reason);
 }
 
-void trsync_join(struct node *node, struct trsync *trsync, struct trsync_member *member) {
-    for (const struct trsync_member *other = trsync->members; other; other = other->next)
-        if (other == member) {
-            node_shutdown(node, STRING(already_joined));
-            return;
-        }
+// A member of two would link their lists, which may then have no end.
+void trsync_join(struct node *node, struct trsync *trsync, struct trsync_member *member,
+                 void (*stop)(struct node *node, struct trsync_member *member)) {
+    if (member->stop) {
+        node_shutdown(node, STRING(already_joined));
+        return;
+    }
+    member->stop = stop;
     if (!trsync->can_trigger) {
-        member->stop(node, member);
+        stop_member(node, member);
         return;
     }
     member->next = trsync->members;

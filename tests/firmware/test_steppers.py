@@ -280,6 +280,17 @@ def test_joining_a_trsync_twice_shuts_down_and_joining_too_late_stops_at_once() 
     assert len(host.steps(STEP)) == 0
 
 
+def test_a_stepper_is_in_one_trsync_at_a_time() -> None:
+    host = machine(BOTH_EDGES, TRSYNC, "config_trsync oid=9")
+    for oid in (8, 9):
+        host.send(f"trsync_start oid={oid} report_clock=0 report_ticks=0 expire_reason=2")
+    host.send("stepper_stop_on_trigger oid=0 trsync_oid=8")
+    host.ask("trsync_trigger oid=8 reason=3")
+    host.send("stepper_stop_on_trigger oid=0 trsync_oid=9")  # it has left the first one
+    host.send("trsync_start oid=8 report_clock=0 report_ticks=0 expire_reason=2")
+    assert "already active" in host.dies("stepper_stop_on_trigger oid=0 trsync_oid=8")
+
+
 ENDSTOP = "config_endstop oid=9 pin=20 pull_up=1"
 HOME = (
     "endstop_home oid=9 clock={clock} sample_ticks=100 sample_count={count} rest_ticks=5000"
