@@ -1,6 +1,7 @@
 """[temperature_fan NAME]: a fan that holds a temperature down.
 
-While its sensor is silent or out of range it runs at its highest speed: the temperature is unknown.
+While its sensor is silent or out of range, or its measurements cannot be handled because of a bug, it runs at
+its highest speed: the temperature is unknown.
 """
 
 from collections.abc import Mapping
@@ -145,7 +146,6 @@ class TemperatureFan(FanModule):
         self.input.end(cause)
 
     def _measured(self, at_s: float, celsius: float) -> None:
-        self._silent = False
         if self.target_c <= 0:
             self.unit.set_speed(0.0)
             return
@@ -158,13 +158,17 @@ class TemperatureFan(FanModule):
     def _look(self, live: "ModuleContext") -> None:
         """Check that there still are measurements."""
         if self.input.missed() <= SILENT_LOOKS:
+            self._silent = False
             return
         self.unit.set_speed(self.max_speed if self.target_c > 0 else 0.0)
         if self._silent or self.target_c <= 0:
             return
         self._silent = True
-        where = f"check node {self.input.node} and its wires" if self.input.node else "find out why"
-        live.say(f"[{self.name}] runs at its highest speed: its sensor is silent; {where}")
+        cure = f"check node {self.input.node} and its wires" if self.input.node else "find out why"
+        what = "its sensor is silent"
+        if self.input.unhandled:
+            what, cure = "its measurements cannot be handled", "this is a bug, please report it"
+        live.say(f"[{self.name}] runs at its highest speed: {what}; {cure}")
 
     @property
     def controls(self) -> bool:

@@ -2,8 +2,9 @@
 
 Three independent safety nets: the controller and the heater check here; the node's own limits of what its
 sensor may read; and the node's max_duration, within which it has to hear from the host.
-The host renews the output with every measurement and with nothing else: no measurements, no heat. Without
-them it ends the heat a moment before the node would have to stop, since the node may have other tasks.
+The host renews the output with every measurement and with nothing else: no measurements, no heat, nor with
+such as cannot be handled because of a bug. Without them it ends the heat a moment before the node would have
+to stop, since the node may have other tasks.
 """
 
 import asyncio
@@ -370,10 +371,10 @@ class Heater:
                 return
         missed = self.input.missed()
         if missed > SILENT_LOOKS:
-            live.stop(
-                f"heater {self.key}: its sensor has been silent for about {missed * LOOK_S:g} s;"
-                f" check node {self.input.node} and its wires"
-            )
+            what, cure = "its sensor has been silent", f"check node {self.input.node} and its wires"
+            if self.input.unhandled:
+                what, cure = "no measurement could be handled", "this is a bug, please report it"
+            live.stop(f"heater {self.key}: {what} for about {missed * LOOK_S:g} s; {cure}")
 
     def _turn_off(self, live: "ModuleContext") -> None:
         if live.node(self.node).state is NodeState.READY:

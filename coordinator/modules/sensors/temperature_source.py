@@ -41,6 +41,8 @@ class TemperatureSource:
         self.on_measured: OnMeasured = _ignore
         self.ratio: float | None = None
         """The last reading of its converter, 0 to 1; None: none yet, or there is no converter."""
+        self.unhandled = False
+        """Whether the last measurement could not be handled, because of a bug."""
         self._live: ModuleContext | None = None
         self._looks = 0
         self._bad = 0
@@ -71,7 +73,7 @@ class TemperatureSource:
         return self.celsius is not None and self.celsius == self.sound_c
 
     def missed(self) -> int:
-        """Return how often this was called since the last measurement."""
+        """Return how often this was called since the last measurement that was handled."""
         self._looks += 1
         return self._looks - 1
 
@@ -100,9 +102,11 @@ class TemperatureSource:
         self.celsius = celsius
         if self.min_c <= celsius <= self.max_c:
             self.sound_c = celsius
-        self._looks = 0
         if self._live is not None:
+            self.unhandled = True  # so it remains if this raises
             self.on_measured(at_s(self._live), celsius)
+            self.unhandled = False
+        self._looks = 0
         self.wake()
 
     def _watch(self, live: "ModuleContext", celsius: float) -> None:

@@ -64,6 +64,28 @@ def test_a_fan_whose_sensor_is_silent_runs_at_its_highest_speed(stage: HeatMachi
     stage.connected(main)
 
 
+def test_a_fan_whose_measurements_cannot_be_handled_runs_at_its_highest_speed(stage: HeatMachine) -> None:
+    """Failed before: it kept the speed that it had."""
+
+    class Broken:
+        def power(self, *_: float) -> float:
+            raise ZeroDivisionError
+
+    async def main() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda *_: None)
+        await asyncio.sleep(1.0)
+        module = stage.machine.modules.find(SIDE, TemperatureFan)
+        assert module is not None
+        module._controller = Broken()  # type: ignore[assignment]
+        await asyncio.sleep((SILENT_LOOKS + 2) * LOOK_S)
+        assert stage.status(SIDE)["speed"] == 0.9
+        await asyncio.sleep(5.0)
+        (told,) = [text for text in stage.notices if "highest speed" in text]
+        assert told.endswith("its measurements cannot be handled; this is a bug, please report it")
+
+    stage.connected(main)
+
+
 def test_a_hotends_fan_is_not_stopped_by_a_torn_wire(stage: HeatMachine) -> None:
     async def main() -> None:
         sensor = Sensor(stage)

@@ -2,6 +2,7 @@
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -120,6 +121,36 @@ def test_a_silent_sensor_stops_the_machine_at_the_third_look(tmp_path: Path) -> 
         assert 3 * LOOK_S - SLACK_S < stage.now_s() - since_s < 4 * LOOK_S + SLACK_S
 
     stage.connected(main)
+
+
+def test_a_heater_whose_measurements_cannot_be_handled_is_switched_off_and_stops_the_machine(
+    tmp_path: Path,
+) -> None:
+    """Failed before: its sensor seemed well, and without heat all went on until it was too cold."""
+    stage = HeatMachine(tmp_path, HOTEND_PID)
+    bugs: list[dict[str, Any]] = []
+
+    class Broken:
+        def power(self, *_: float) -> float:
+            raise ZeroDivisionError
+
+        def settled(self, *_: float) -> bool:
+            raise ZeroDivisionError
+
+    async def main() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: bugs.append(context))
+        sensor = await heating(stage)
+        await sensor.unit.input.next()
+        since_s = stage.now_s()
+        sensor.unit.use(Broken())
+        assert (
+            "heater extruder: no measurement could be handled for about 3 s; this is a bug, please report it"
+        ) in await stage.stopped()
+        assert stage.now_s() - since_s < 4 * LOOK_S + SLACK_S
+        assert stage.heater_off_after(since_s) < LIMIT_S - 0.1
+
+    stage.connected(main)
+    assert [bug["message"].partition(" could")[0] for bug in bugs] == ["node toolhead: analog_in_state"]
 
 
 def test_a_heater_whose_sensors_node_goes_away_forgets_all(tmp_path: Path) -> None:
