@@ -1,10 +1,11 @@
 """[temperature_probe]: an eddy current probe whose coil gets warm, on a virtual bed in virtual time."""
 
 import ast
+import asyncio
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ import pytest
 
 from coordinator.config.errors import ConfigError
 from coordinator.gcode.errors import GCodeError
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.eddy_current.coil_drift import HEIGHTS
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.virtual_machine.plant_bed import BedSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.virtual.plant import Bed
@@ -261,6 +264,73 @@ def test_an_abort_switches_the_heaters_off(tmp_path: Path) -> None:
     bed, after, own = (ast.literal_eval(text[6:]) for text in output if text.startswith("echo: {"))
     assert (bed["target"], after["target"]) == (60, 0)
     assert not own["in_calibration"]
+
+
+def calibrating(stage: ProbeStage, folder: Path, main: Callable[[Served], Awaitable[None]]) -> None:
+    """Run MAIN with a service, Z homed; then the calibration has to be over, and all that it heats off."""
+    served = Served(folder, lambda: stage.description, stage.host)
+
+    async def whole() -> None:
+        async with running(served):
+            await gcode(served, "G28", "G1 X100 Y100 Z1 F6000")
+            await main(served)
+            assert served.service.machine is not None
+            modules = served.service.machine.modules
+            assert not modules.status()[NAME]["in_calibration"]
+            (heaters,) = modules.of(HeaterRegistry)
+            assert heaters.units
+            await served.until(lambda: not heaters.targets, "all heaters off")
+            assert "temperature_probe coil: the calibration ended early; nothing is kept" in served.lines
+
+    stage.run(whole)
+
+
+@pytest.mark.parametrize(
+    ("own", "why"),
+    [
+        ({"calibration_position": "150, 60, 300"}, "Z"),
+        ({"calibration_position": "250, 60, 2"}, "X"),
+        ({"calibration_extruder_temp": 260, "calibration_position": "150, 60, 2"}, "260 °C is outside"),
+    ],
+)
+def test_a_beginning_that_fails_heats_nothing(tmp_path: Path, own: dict[str, Any], why: str) -> None:
+    """Failed before: the bed stayed on, and the calibration was thought to go on."""
+    stage = stage_with(tmp_path, own={"calibration_bed_temp": 60, **own}, z=SWITCH, sections=EXTRUDER)
+
+    async def main(served: Served) -> None:
+        with pytest.raises(ApiError, match=why):
+            await gcode(served, "TEMPERATURE_PROBE_CALIBRATE")
+
+    calibrating(stage, tmp_path, main)
+
+
+def test_a_sample_that_fails_ends_it(tmp_path: Path) -> None:
+    stage = stage_with(tmp_path, own={"calibration_bed_temp": 60}, z=SWITCH)
+
+    async def main(served: Served) -> None:
+        await gcode(served, "TEMPERATURE_PROBE_CALIBRATE", "TESTZ Z=-0.5")
+        # Nine heights above this place: the last ones are outside.
+        await gcode(served, "G1 X5 Y5 F6000")
+        with pytest.raises(ApiError, match="X"):
+            await gcode(served, "ACCEPT")
+
+    calibrating(stage, tmp_path, main)
+
+
+def test_a_script_that_is_cancelled_ends_it(tmp_path: Path) -> None:
+    own = {"calibration_bed_temp": 60, "calibration_extruder_temp": 200}
+    stage = stage_with(tmp_path, own=own, z=SWITCH, sections=EXTRUDER)
+
+    async def main(served: Served) -> None:
+        script = asyncio.ensure_future(gcode(served, "TEMPERATURE_PROBE_CALIBRATE"))
+        assert served.service.machine is not None
+        (heaters,) = served.service.machine.modules.of(HeaterRegistry)
+        await served.until(lambda: heaters.targets == {"heater_bed": 60, "extruder": 200}, "the heat")
+        script.cancel()
+        await asyncio.gather(script, return_exceptions=True)
+        await served.until(lambda: not heaters.targets, "the end")
+
+    calibrating(stage, tmp_path, main)
 
 
 def test_it_begins_where_it_is_configured(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ first. TEMPERATURE_PROBE_NEXT begins that search, by itself when the coil is war
 """
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
@@ -28,6 +29,7 @@ from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module
 from coordinator.modules.eddy_current.coil_drift import HEIGHTS, LEAST, CoilDrift, Sample, drift_of
 from coordinator.modules.eddy_current.eddy_probe import EddyProbe
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.probes.probe import lift
 
@@ -211,6 +213,7 @@ class DriftCalibration(Module):
         self.coil: Coil | None = None
         """That of the machine's probe; None: it has none whose temperature is measured."""
         self._calibration: _Calibration | None = None
+        self._heaters = build.shared(HeaterRegistry)
         self._manual = build.shared(ManualProbe)
         self._manual.others.append(self)
         for name, text, read in (
@@ -301,24 +304,37 @@ class DriftCalibration(Module):
             return Done()
 
         def run(job: ProgramContext) -> Iterator[Reading]:
-            yield AtStandstill(begin)
-            if self._calibration is not None:
-                yield from self._prepare(job, coil.procedure)
-                yield self._search(job.call(call.command))
+            with self._ending_early():
+                yield AtStandstill(begin)
+                if self._calibration is not None:
+                    yield from self._prepare(job, coil.procedure)
+                    yield self._search(job.call(call.command))
 
         return Phases(run)
 
     def _prepare(self, job: ProgramContext, to: Procedure) -> Iterator[Reading]:
         """Heat what is to be heated, and go where the calibration is to begin."""
         if to.bed_c:
-            yield Lines(f"SET_HEATER_TEMPERATURE HEATER=heater_bed TARGET={to.bed_c:g}")
+            yield self._heat("heater_bed", to.bed_c)
         if to.extruder_c:
             yield from lift(job, max(to.heating_z, job.planner.toolhead_position[2]), to.speed)
-            yield Lines(f"SET_HEATER_TEMPERATURE HEATER=extruder TARGET={to.extruder_c:g}")
+            yield self._heat("extruder", to.extruder_c)
             yield Lines(f"TEMPERATURE_WAIT SENSOR=extruder MINIMUM={to.extruder_c - 2:g}")
         if to.position is not None:
             yield from lift(job, max(to.height, job.planner.toolhead_position[2]), to.speed)
             yield from self._approach(job, to.position, to.speed)
+
+    def _heat(self, name: str, celsius: float) -> AtStandstill:
+        """Return what sets a target at once: one that waits for its time might outlast the calibration."""
+        unit = self._heaters.units.get(name)
+        if unit is None:
+            raise WordError(f"the calibration needs {name}, which does not act")
+        unit.check_target(celsius)
+
+        async def perform() -> None:
+            unit.set_target(celsius)
+
+        return AtStandstill(perform)
 
     def _approach(self, job: ProgramContext, place: Point, speed: float) -> Iterator[Reading]:
         """Go to a PLACE, with its height at the end."""
@@ -351,9 +367,11 @@ class DriftCalibration(Module):
 
     def _sample(self, job: ProgramContext, touched: Point) -> Iterator[Reading]:
         """Measure above the place where the nozzle TOUCHED the bed."""
-        going_on = self._calibration
-        if going_on is None:
-            return
+        if (going_on := self._calibration) is not None:
+            with self._ending_early():
+                yield from self._measure(job, touched, going_on)
+
+    def _measure(self, job: ProgramContext, touched: Point, going_on: _Calibration) -> Iterator[Reading]:
         coil, measured = going_on.coil, list[float | None]()
         points = yield from coil.probe.measure_above(
             job, going_on.command, touched, HEIGHTS, lambda: measured.append(coil.celsius)
@@ -390,7 +408,12 @@ class DriftCalibration(Module):
                 f"{call.command.name}: {len(going_on.samples)} of {LEAST} samples are there; go on with"
                 " TEMPERATURE_PROBE_NEXT, or ABORT"
             )
-        return Phases(lambda _: self._complete(going_on))
+
+        def run(_: ProgramContext) -> Iterator[Reading]:
+            with self._ending_early():
+                yield from self._complete(going_on)
+
+        return Phases(run)
 
     def _complete(self, going_on: _Calibration) -> Iterator[Reading]:
         coil, drift, lowest_c = going_on.coil, drift_of(going_on.samples), going_on.coldest_c
@@ -412,7 +435,28 @@ class DriftCalibration(Module):
 
     def _end(self, told: str) -> Iterator[Reading]:
         """End the calibration, with its heaters switched off."""
-        going_on, self._calibration = self._calibration, None
-        for heater in () if going_on is None else going_on.heated():
-            yield Lines(f"SET_HEATER_TEMPERATURE HEATER={heater} TARGET=0")
+        self._switch_off()
         yield Immediate((told,))
+
+    @contextmanager
+    def _ending_early(self) -> Iterator[None]:
+        """End the calibration where the block does not come to its end: it fails, or is cancelled."""
+        try:
+            yield
+        except BaseException:
+            self._switch_off("the calibration ended early; nothing is kept")
+            raise
+
+    def _switch_off(self, why: str = "") -> None:
+        """Forget the calibration and switch its heaters off, from the reader's thread; WHY is shown."""
+        going_on, self._calibration = self._calibration, None
+        if going_on is None or (live := self._live) is None:
+            return
+
+        def act() -> None:
+            for name in self._heaters.units.keys() & set(going_on.heated()):
+                self._heaters.units[name].set_target(0.0)
+            if why:
+                live.say(f"{going_on.coil.name}: {why}")
+
+        live.soon_on_loop(act)
