@@ -144,6 +144,15 @@ def raising(error: BaseException) -> Callable[[], PlainReport]:
     return fail
 
 
+def test_every_exit_status_is_documented_once() -> None:
+    """Failed before: four of them were in the page of the CAN tools only, two nowhere."""
+    page = (Path(__file__).parents[3] / "docs" / "run.md").read_text(encoding="utf-8")
+    section = page.partition("## Exit status\n")[2].partition("\n## ")[0]
+    plain = [cli.EXIT_OK, cli.EXIT_FAILED, cli.EXIT_USAGE, cli.EXIT_BUG]
+    known = [*map(str, plain), f"{cli.EXIT_SIGNAL} + n", str(cli.EXIT_BROKEN_PIPE)]
+    assert re.findall(r"^\| (\d[^|]*) \|", section, re.MULTILINE) == known
+
+
 FAILURES: list[tuple[BaseException, int, str]] = [
     (CanductorError("node 'mcu' is silent; check its power"), 1, "node 'mcu' is silent; check its power"),
     (KeyboardInterrupt(), 130, "stopped by Ctrl-C"),
