@@ -74,6 +74,22 @@ def test_no_reader_waits(tmp_path: Path, reader: str, kind: str) -> None:
     assert "regular file" in str(refused.value) or kind == "folder"
 
 
+@pytest.mark.parametrize("spoiled", ["x" * 256, "file/x", "loop/x"])
+@pytest.mark.parametrize("reader", READERS)
+def test_a_path_that_cannot_be_looked_at_is_no_bug(tmp_path: Path, reader: str, spoiled: str) -> None:
+    """Nor is a folder that may not be entered."""
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to("loop")
+    read, path = READERS[reader], tmp_path / spoiled / "x.table.json"
+    if reader == "table":
+        assert "cannot be read" in str(read(path))
+    elif reader in ("journal", "history") or (reader == "sessions of the page" and spoiled == "file/x"):
+        assert not read(path)
+    else:
+        with pytest.raises(OSError if reader == "opener" else CanductorError):
+            read(path)
+
+
 def test_a_secret_is_not_read_without_end(tmp_path: Path) -> None:
     path = tmp_path / "tokens"
     with path.open("wb") as file:

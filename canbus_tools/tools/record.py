@@ -19,6 +19,7 @@ from canbus_tools.recordings.mcap_file import McapWriter
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
+from nodes.support.file_kind import exists
 from nodes.support.option_values import UsageError, decimal, parse_path
 from nodes.support.terminal import show_error
 
@@ -55,9 +56,9 @@ def declare(command: argparse.ArgumentParser) -> None:
 
 
 def make_job(given: argparse.Namespace) -> "Callable[[Computer], RecordReport]":
-    """Return the job; raises UsageError."""
+    """Return the job; raises UsageError, CanductorError."""
     path: Path = given.output
-    if path.exists() and not given.force:
+    if exists(path) and not given.force:
         raise UsageError(f"'{path}' exists already; give --force to overwrite it")
     options = bus_options(given)
     return lambda computer: record_bus(computer, options, path, given.duration, given.dictionaries)

@@ -23,6 +23,8 @@ from coordinator.support.toml_values import (
     text,
     whole,
 )
+from nodes.support.errors import CanductorError
+from nodes.support.file_kind import is_regular
 
 SCENARIOS: Final = Path(__file__).parent / "scenarios"
 MACHINES: Final = Path(__file__).parent / "machines"
@@ -294,8 +296,11 @@ def _parse(path: Path) -> dict[str, Any]:
 
 def _machine(name: str, scenario: Path) -> Path:
     for path in (MACHINES / f"{name}.cfg", scenario.parent / name):
-        if path.is_file():
-            return path
+        try:
+            if is_regular(path):
+                return path
+        except CanductorError as error:
+            raise ScenarioError(f"{scenario.name}: the machine {error}") from None
     known = sorted(path.stem for path in MACHINES.glob("*.cfg"))
     raise ScenarioError(
         f"{scenario.name}: there is no machine {shown(name)}: neither a file in the scenario's folder "

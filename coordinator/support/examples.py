@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from nodes.support.errors import CanductorError
+from nodes.support.file_kind import is_regular
 
 
 def _examples() -> Path:
@@ -20,17 +21,14 @@ DEMO_GCODE: Final = EXAMPLES / "demo" / "part.gcode"
 
 def find_machine(name: str) -> Path:
     """Return the configuration file of a path or of an example's name; raises CanductorError."""
-    path = Path(name)
-    try:
-        if path.is_file():
-            return path
-        examples = {machine_name(p): p for p in sorted(EXAMPLES.rglob("*.cfg"))}
-    except (OSError, ValueError):  # a name too long, or with a NUL
-        examples = {}
+    if is_regular(name):
+        return Path(name)
+    examples = {machine_name(path): path for path in sorted(EXAMPLES.rglob("*.cfg"))}
     if name in examples:
         return examples[name]
-    known = f"; examples are {', '.join(examples)}" if examples else ""
-    raise CanductorError(f"there is no machine '{name}': neither a file nor an example{known}")
+    raise CanductorError(
+        f"there is no machine '{name}': neither a file nor an example; examples are {', '.join(examples)}"
+    )
 
 
 def machine_name(path: Path) -> str:

@@ -8,6 +8,7 @@ from coordinator.ipc.protocol.methods import Scope
 from coordinator.support.atomic_file import atomic_write, sync_folder
 from coordinator.web.access import SESSIONS_MAX, PageSession
 from nodes.support.errors import CanductorError
+from nodes.support.file_kind import exists
 from nodes.support.plain_json import read_json
 from nodes.support.secret_file import read_secret
 
@@ -19,7 +20,7 @@ def read_sessions(path: Path) -> list[PageSession]:
 
     Raises CanductorError when it cannot be read, others can read or change it, or it is none of ours.
     """
-    if not path.exists():
+    if not exists(path):
         return []
     text, _ = read_secret(path, "the page's sessions")
     try:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from nodes.support.errors import CanductorError
+from nodes.support.file_kind import exists, is_folder, is_regular
 from nodes.support.numbers import read_decimal, read_int
 from nodes.support.terminal import show
 
@@ -182,9 +183,9 @@ def _invalid(name: str, text: str, rule: str) -> UsageError:
 def existing_file(path: str | Path) -> Path:
     """Return the path of a file that can be read; raises CanductorError."""
     path = Path(path)
-    if not path.exists():
+    if not exists(path):
         raise CanductorError(f"there is no file '{path}'")
-    if path.is_dir():
+    if is_folder(path):
         raise CanductorError(f"'{path}' is a folder, not a file")
     if not os.access(path, os.R_OK):
         raise CanductorError(f"'{path}' may not be read; check its permissions")
@@ -194,7 +195,7 @@ def existing_file(path: str | Path) -> Path:
 def regular_file(path: str | Path) -> Path:
     """Return the path of a file that can be read, but of no pipe and no device; raises CanductorError."""
     path = existing_file(path)
-    if not path.is_file():
+    if not is_regular(path):
         raise CanductorError(f"'{path}' is not a regular file; save its content to one, and give that")
     return path
 

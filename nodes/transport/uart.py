@@ -135,10 +135,10 @@ def _report_empty_reads(fd: int) -> None:
 
 def _cannot_open(path: str | Path, baud: int, error: Exception) -> CanductorError:
     where = f"UART {path}: cannot open it at {baud} baud: "
-    if not Path(path).exists():
-        return CanductorError(where + "there is no such device; list the devices with 'ls /dev/serial/by-id'")
     if isinstance(error, PermissionError) or (isinstance(error, OSError) and error.errno == 13):
         return CanductorError(where + "permission denied; add the user to the group 'dialout'")
+    if not os.path.exists(path):  # noqa: PTH110 (Path.exists raises for a name that is too long)
+        return CanductorError(where + "there is no such device; list the devices with 'ls /dev/serial/by-id'")
     if isinstance(error, OSError) and "exclusively lock" in str(error):
         return CanductorError(where + "another program uses it; stop that program first")
     return CanductorError(where + f"{error}; is it a serial device, and does it support this rate?")

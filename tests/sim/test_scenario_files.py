@@ -99,6 +99,7 @@ def test_a_draw_depends_on_its_key_alone() -> None:
         ('causes = ["lost node"]', "", r"expect is 'stops' and needs causes"),
         ('["lost node"]', '["lost ("]', r"causes is .*'lost \(' is none"),
         ('"pair"', '"pear"', r"there is no machine 'pear'.*pair"),
+        ('"pair"', f'"{"x" * 300}"', r"mine.toml: the machine '.*x.cfg' cannot be looked at: file name too"),
         ("[[faults]]", "[faults]", r"faults must be written as \[\[faults\]\]"),
         ("[nodes.toolhead]", "[node.toolhead]", r"there is no table 'node'; did you mean \[nodes\]\?"),
         ("about", "about about", r"this is not TOML"),

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from coordinator.front_ends.serve import ServeOptions
 from coordinator.support.examples import machine_name
+from nodes.support.file_kind import is_folder
 from nodes.support.numbers import read_int
 from nodes.support.option_values import UsageError, options_from, regular_file
 
@@ -170,10 +171,9 @@ def _is_beyond_loopback(address: tuple[str, int]) -> bool:
 
 
 def _folder(text: str) -> Path:
-    path = Path(text)
-    if not path.is_dir():
+    if not is_folder(text):
         raise UsageError(f"is '{text}', must be a folder; create it")
-    return path
+    return Path(text)
 
 
 def _host_name(text: str) -> str:

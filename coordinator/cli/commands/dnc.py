@@ -259,7 +259,7 @@ def _drip(given: argparse.Namespace) -> Report:
     prints = given.file is None
     machine = _machine(given, prints=prints, hint="give --from or --from-control as well")
     file = None if prints else Path(given.file)
-    if file is not None and str(file) != "-" and not file.is_fifo():
+    if file is not None and str(file) != "-":
         existing_file(file)
     job = _job(
         given,

@@ -225,7 +225,7 @@ class Client:
                 self._reader, self._writer = await asyncio.open_connection(
                     address.host, address.port, ssl=tls
                 )
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise ConnectionLost(connect_error_sentence(address, error)) from None
         if address.path is not None:
             self._check_server(self._writer)

@@ -16,8 +16,10 @@ _NO_TLS: Final = ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "PACKET_LENGTH
 """What OpenSSL, by its version, says of a first answer that is no TLS."""
 
 
-def connect_error_sentence(address: Address, error: OSError) -> str:
+def connect_error_sentence(address: Address, error: OSError | ValueError) -> str:
     """Return a sentence on ERROR, with which connecting to ADDRESS failed."""
+    if not isinstance(error, OSError):  # an empty label, one of more than 63 characters, NUL
+        return f"{address} does not answer: nothing can have this name; correct it"
     if isinstance(error, ssl.SSLError):
         return _tls_error_sentence(address, error)
     if not isinstance(error, ConnectionRefusedError):

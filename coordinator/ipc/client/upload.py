@@ -8,7 +8,7 @@ from typing import Any
 from coordinator.ipc.client.client import Client
 from coordinator.ipc.client.target import Target
 from coordinator.ipc.server.uploads import PART_MAX
-from nodes.support.errors import CanductorError
+from nodes.support.option_values import regular_file
 from nodes.support.terminal import show
 
 
@@ -32,9 +32,7 @@ def send_program(
 
     ON_PROGRESS gets the bytes sent and those of the whole file. Raises CanductorError.
     """
-    if file.exists() and not file.is_file():
-        raise CanductorError(f"{file} is no regular file; save its content to one, and send that")
-    size = file.stat().st_size
+    size = regular_file(file).stat().st_size
 
     async def send(client: Client) -> Any:
         sent = 0

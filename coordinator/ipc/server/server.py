@@ -204,7 +204,11 @@ class IpcServer:
             await listener.open(tcp.host, tcp.port)
         except OSError as error:
             raise CanductorError(
-                f"port {tcp.port} of {tcp.host} cannot be opened: {error.strerror}"
+                f"port {tcp.port} of {tcp.host} cannot be opened: {error.strerror or error}"
+            ) from None
+        except UnicodeError:  # an empty label, or one of more than 63 characters
+            raise CanductorError(
+                f"port {tcp.port} of {tcp.host} cannot be opened: no host can have this name"
             ) from None
         self.tcp_port = listener.addresses[0][1]
         self.tcp_addresses = [address for address, _ in listener.addresses]

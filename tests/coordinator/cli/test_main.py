@@ -297,6 +297,50 @@ def test_files_that_are_not_there(
     assert runners.asked == []
 
 
+LONG = "x" * 256
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "run {}",
+        "run my.cfg --gcode {}",
+        "run my.cfg --jobs {}",
+        "run my.cfg --tls-key {}",
+        "plan {} part.gcode",
+        "plan my.cfg {}",
+        "plan my.cfg part.gcode --dictionary mcu={}",
+        "demo --machine {}",
+        "demo --gcode {}",
+        "config check {}",
+        "send {} --at none",
+        "status --token-file {}",
+        "status --certificate {}",
+        "table check {}",
+        "can decode {}",
+        "can record -o {}.log",
+        "dnc drip {} -p none",
+        "dnc send {} -p none",
+    ],
+)
+def test_a_name_that_is_too_long_is_no_bug(
+    runners: Runners, files: Path, capsys: pytest.CaptureFixture[str], words: str
+) -> None:
+    """As a file in another user's folder: what looked at it raised OSError."""
+    assert cli.main(words.format(LONG).split()) == 1
+    name = LONG + (".log" if "record" in words else "")
+    assert capsys.readouterr().err == f"canductor: '{name}' cannot be looked at: file name too long\n"
+    assert runners.asked == []
+
+
+@pytest.mark.parametrize("host", ["a..b", "x" * 64, ".local", f"a.{LONG}"])
+def test_a_host_that_cannot_be_is_no_bug(host: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for scheme in ("tcp", "tls"):
+        assert cli.main(["status", "--at", f"{scheme}://{host}:80"]) == 1
+        answer = f"{scheme}://{host}:80 does not answer: nothing can have this name; correct it"
+        assert capsys.readouterr().err == f"canductor: {answer}\n"
+
+
 def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
     assert re.fullmatch(r"canductor \d+\.\d+\.\d+\n", capsys.readouterr().out)

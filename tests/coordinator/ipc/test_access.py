@@ -189,6 +189,16 @@ def test_tcp_settings_that_are_not_safe(tmp_path: Path, change: dict[str, Any], 
     assert not (tmp_path / "m.sock").exists()
 
 
+@pytest.mark.parametrize("host", ["a..b", "x" * 64])
+def test_a_host_that_cannot_be_is_refused(tmp_path: Path, certificate: tuple[Path, Path], host: str) -> None:
+    pem, key = certificate
+    tcp = TcpSettings(host=host, port=80, tokens=tokens_file(tmp_path), certificate=pem, private_key=key)
+    with pytest.raises(CanductorError) as refused:
+        run(tmp_path, lambda _: asyncio.sleep(0), tcp=tcp)
+    assert str(refused.value) == f"port 80 of {host} cannot be opened: no host can have this name"
+    assert not (tmp_path / "m.sock").exists()
+
+
 def test_tokens_that_others_can_read_are_refused(tmp_path: Path) -> None:
     tcp = plain_tcp(tmp_path)
     tokens_file(tmp_path, 0o640)

@@ -311,6 +311,8 @@ def test_bus_that_does_not_exist_is_told_in_one_sentence(spec: str, said: str) -
 def test_uart_that_cannot_be_had(tmp_path: Path) -> None:
     with pytest.raises(CanductorError, match="there is no such device"):
         open_uart(tmp_path / "tty")
+    with pytest.raises(CanductorError, match="there is no such device"):
+        open_uart(tmp_path / ("x" * 256))
     (tmp_path / "file").touch()
     with pytest.raises(CanductorError, match="is it a serial device"):
         open_uart(tmp_path / "file")

@@ -285,7 +285,7 @@ def test_what_is_no_regular_file_is_not_sent(tmp_path: Path, canductor: Command)
         os.mkfifo(tmp_path / "pipe.gcode")
         for path in ("/dev/zero", str(tmp_path / "pipe.gcode")):
             status, _, err = canductor("send", path, "--name", "z.gcode")
-            assert (status, f"{path} is no regular file" in err) == (1, True), err
+            assert (status, f"'{path}' is not a regular file" in err) == (1, True), err
         assert list((tmp_path / "jobs").iterdir()) == []
 
 
