@@ -7,10 +7,14 @@ from typing import Final, NamedTuple
 from nodes.devices.device import Device, ignore
 from nodes.devices.ticks import start_clock, ticks_for
 from nodes.dictionary.message_format import Message
+from nodes.dictionary.vocabulary import carries
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
 
 COMMANDS: Final = ("config_analog_in", "query_analog_in")
+REPORT: Final = "analog_in_state oid=%c next_clock=%u values=%*s"
+REPORT_OF_ONE: Final = "analog_in_state oid=%c next_clock=%u value=%hu"
+"""That of older firmware."""
 SAMPLES: Final = 8
 SAMPLE_S: Final = 1e-3
 REPORT_S: Final = 0.3
@@ -57,7 +61,8 @@ class AnalogIn(Device):
 
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
-        config.require(self.description, COMMANDS)
+        report = REPORT if carries(config.dictionary, REPORT) else REPORT_OF_ONE
+        config.require(self.description, COMMANDS, (report,))
         adc_max = config.dictionary.int_constant("ADC_MAX")
         samples = max(1, min(SAMPLES, SUM_LIMIT // adc_max))
         self._full = adc_max * samples

@@ -17,6 +17,7 @@ COMMANDS: Final = (
     *("sos_filter_set_state", "config_trigger_analog", "trigger_analog_set_raw_range"),
     *("trigger_analog_set_trigger", "trigger_analog_home", "trigger_analog_query_state"),
 )
+RESPONSES: Final = ("trigger_analog_state oid=%c homing=%c homing_clock=%u",)
 UNITS: Final = 1024
 """Of what is compared, in one of the quantity."""
 COEFF_BITS: Final = 29
@@ -44,7 +45,7 @@ class AnalogTrigger:
 
     def configure(self, config: NodeConfig, attach: str, sensor_oid: int) -> None:
         """Add it to a node's CONFIG, by the command ATTACH to its sensor; raises NodeConfigError."""
-        config.require(self._what, (*COMMANDS, attach))
+        config.require(self._what, (*COMMANDS, attach), RESPONSES)
         self._filter_oid, self._oid = config.create_oid(), config.create_oid()
         for command in (
             f"config_sos_filter oid={self._filter_oid} max_sections={len(self.sections)}",

@@ -18,6 +18,10 @@ from nodes.dictionary.message_format import Message
 from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
+RESPONSES: Final = (
+    "sensor_bulk_data oid=%c sequence=%hu data=%*s",
+    "sensor_bulk_status oid=%c clock=%u next_sequence=%hu buffered=%u possible_overflows=%hu",
+)
 MESSAGE_BYTES: Final = 48
 """Of readings in a full message."""
 READING_BYTES: Final = 4

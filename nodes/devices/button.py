@@ -13,6 +13,7 @@ from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
 COMMANDS: Final = ("config_buttons", "buttons_add", "buttons_query", "buttons_ack")
+RESPONSES: Final = ("buttons_state oid=%c ack_count=%c state=%*s",)
 POLL_S: Final = 0.002
 REPEAT_SAMPLES: Final = 50
 """Samples after which the node repeats a report that the host has not acknowledged."""
@@ -38,7 +39,7 @@ class Button(Device):
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
         what = self.description
-        config.require(what, COMMANDS)
+        config.require(what, COMMANDS, RESPONSES)
         self._poll_ticks = ticks_for(config, what, POLL_S)
         self.oid = config.create_oid()
         config.add_config(what, f"config_buttons oid={self.oid} button_count=1")

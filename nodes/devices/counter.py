@@ -11,6 +11,7 @@ from nodes.node.config import NodeConfig
 from nodes.node.node import Node
 
 COMMANDS: Final = ("config_counter", "query_counter")
+RESPONSES: Final = ("counter_state oid=%c count=%u count_clock=%u",)
 _MODULUS: Final = 1 << 32
 
 
@@ -36,7 +37,7 @@ class Counter(Device):
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
         what = self.description
-        config.require(what, COMMANDS)
+        config.require(what, COMMANDS, RESPONSES)
         self._poll_ticks = ticks_for(config, what, self._poll_s)
         self._report_ticks = ticks_for(config, what, self._report_s)
         self._freq_hz = config.dictionary.clock_freq_hz

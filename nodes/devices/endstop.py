@@ -11,6 +11,7 @@ from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
 COMMANDS: Final = ("config_endstop", "endstop_home", "endstop_query_state")
+RESPONSES: Final = ("endstop_state oid=%c homing=%c next_clock=%u pin_value=%c",)
 SAMPLE_S: Final = 15e-6
 """Time between two samples of one check."""
 SAMPLE_COUNT: Final = 4
@@ -40,7 +41,7 @@ class Endstop(Device):
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
         what = self.description
-        config.require(what, COMMANDS)
+        config.require(what, COMMANDS, RESPONSES)
         self.oid = config.create_oid()
         config.add_config(what, f"config_endstop oid={self.oid} pin={self._pin} pull_up={self._pull}")
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from nodes.devices.analog_trigger import AnalogTrigger, Section
-from nodes.devices.bulk_sensor import BulkSensor
+from nodes.devices.bulk_sensor import RESPONSES, BulkSensor
 from nodes.devices.endstop import EndstopState
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
@@ -88,7 +88,7 @@ class Hx71x(BulkSensor[Reading]):
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware or pins do not allow it."""
         what = self.description
-        config.require(what, COMMANDS)
+        config.require(what, COMMANDS, RESPONSES)
         self._rest_ticks = round(config.dictionary.clock_freq_hz / self.rate_hz / LOOKS)
         self.oid = config.create_oid()
         pins = f"dout_pin={self._dout_pin} sclk_pin={self._sclk_pin}"

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
+from nodes.devices import bulk_sensor
 from nodes.devices.bulk_sensor import BulkSensor, SensorError
 from nodes.devices.endstop import EndstopState
 from nodes.devices.trsync import TriggerReason
@@ -19,6 +20,11 @@ from nodes.node.node import Node
 COMMANDS: Final = (
     *("config_i2c", "i2c_set_bus", "i2c_transfer", "config_ldc1612", "query_ldc1612", "query_status_ldc1612"),
     *("ldc1612_setup_home", "query_ldc1612_home_state"),
+)
+RESPONSES: Final = (
+    *bulk_sensor.RESPONSES,
+    "i2c_response oid=%c i2c_bus_status=%c response=%*s",
+    "ldc1612_home_state oid=%c homing=%c trigger_clock=%u",
 )
 RATE_HZ: Final = 250.0
 """Readings per second."""
@@ -114,7 +120,7 @@ class Ldc1612(BulkSensor[Reading]):
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware, bus or pin do not allow it."""
         what = self.description
-        config.require(what, COMMANDS)
+        config.require(what, COMMANDS, RESPONSES)
         known = config.dictionary.enumerations.get("i2c_bus")
         names = list(known.values) if known is not None else []
         if not names or (self._bus and self._bus not in names):

@@ -15,6 +15,7 @@ COMMANDS: Final = (
     "reset_step_clock",
     "stepper_get_position",
 )
+RESPONSES: Final = ("stepper_position oid=%c pos=%i",)
 
 
 class Stepper(Device):
@@ -50,7 +51,7 @@ class Stepper(Device):
     def configure(self, config: NodeConfig) -> None:
         """Add the stepper to its node's CONFIG; NodeConfigError when firmware or pins do not allow it."""
         dictionary = config.dictionary
-        config.require(self.name, COMMANDS)
+        config.require(self.name, COMMANDS, RESPONSES)
         able = any(dictionary.int_constant(name, 0) == 1 for name in BOTH_EDGE_CONSTANTS)
         if self.steps_on_both_edges and not able:
             raise NodeConfigError(

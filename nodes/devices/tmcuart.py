@@ -15,6 +15,7 @@ from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
 COMMANDS: Final = ("config_tmcuart", "tmcuart_send")
+RESPONSES: Final = ("tmcuart_response oid=%c read=%*s",)
 BAUD: Final = 40_000
 BAUD_SLOW: Final = 9_000
 """On 8-bit micro-controllers."""
@@ -42,7 +43,7 @@ class TmcUart(Device):
 
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware or pins do not allow it."""
-        config.require(self.description, COMMANDS)
+        config.require(self.description, COMMANDS, RESPONSES)
         mcu = config.dictionary.constants.get("MCU", "")
         slow = isinstance(mcu, str) and mcu.startswith(SLOW_MCUS)
         bit_time = round(config.dictionary.clock_freq_hz / (BAUD_SLOW if slow else BAUD))

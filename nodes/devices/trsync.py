@@ -13,6 +13,7 @@ from nodes.node.node import Node
 from nodes.node.request_reply import QUERY_TRIES
 
 COMMANDS: Final = ("config_trsync", "trsync_start", "trsync_set_timeout", "trsync_trigger")
+RESPONSES: Final = ("trsync_state oid=%c can_trigger=%c trigger_reason=%c clock=%u",)
 GROUPS_CONSTANT: Final = "CAN_TRIGGER_GROUPS"
 """Constant of the dictionary: number of trigger groups of the firmware; other firmware has none."""
 NO_GROUP: Final = 255
@@ -61,7 +62,7 @@ class Trsync(Device):
 
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when the firmware has no stop groups."""
-        config.require(self._purpose, COMMANDS)
+        config.require(self._purpose, COMMANDS, RESPONSES)
         self.groups = config.dictionary.int_constant(GROUPS_CONSTANT, 0)
         self.oid = config.create_oid()
         config.add_config(self._purpose, f"config_trsync oid={self.oid}")

@@ -18,18 +18,17 @@ REQUIRED_COMMANDS: Final = {
     "get_clock": (),
     "get_uptime": (),
 }
-REQUIRED_RESPONSES: Final = {
-    "config": ("is_config", "crc", "is_shutdown", "move_count"),
-    "clock": ("clock",),
-    "uptime": ("high", "clock"),
-}
-OPTIONAL_RESPONSES: Final = {
-    "stats": ("count", "sum", "sumsq"),
-    "shutdown": ("clock", "static_string_id"),
-    "is_shutdown": ("static_string_id",),
-    "stepper_position": ("oid", "pos"),
-    "sync_pulse": ("seq", "clock"),
-}
+REQUIRED_RESPONSES: Final = (
+    "config is_config=%c crc=%u is_shutdown=%c move_count=%hu",
+    "clock clock=%u",
+    "uptime high=%u clock=%u",
+)
+OPTIONAL_RESPONSES: Final = (
+    "stats count=%u sum=%u sumsq=%u",
+    "shutdown clock=%u static_string_id=%hu",
+    "is_shutdown static_string_id=%hu",
+    "sync_pulse seq=%c clock=%u",
+)
 
 
 def check_vocabulary(dictionary: Dictionary) -> None:
@@ -37,30 +36,35 @@ def check_vocabulary(dictionary: Dictionary) -> None:
     for name, params in REQUIRED_COMMANDS.items():
         found = dictionary.commands.get(name)
         if found is None or found.names != params:
-            raise _unusable(dictionary, "command", name, params)
-    optional = {name: p for name, p in OPTIONAL_RESPONSES.items() if name in dictionary.responses}
-    for name, params in (REQUIRED_RESPONSES | optional).items():
-        if name not in dictionary.responses or not _carries(dictionary, name, params):
-            raise _unusable(dictionary, "response", name, params)
+            raise _unusable(dictionary, "command", " ".join((name, *params)))
+    optional = [text for text in OPTIONAL_RESPONSES if text.split(" ")[0] in dictionary.responses]
+    for text in (*REQUIRED_RESPONSES, *optional):
+        if not carries(dictionary, text):
+            raise _unusable(dictionary, "response", text)
     dictionary.check_constants()
 
 
 def carries_identity(dictionary: Dictionary) -> bool:
     """Return whether the node answers get_canbus_id with its uuid as bytes."""
-    format_ = dictionary.responses.get("canbus_id")
     asked = dictionary.commands.get("get_canbus_id")
-    if format_ is None or asked is None or asked.names:
+    return asked is not None and not asked.names and carries(dictionary, "canbus_id canbus_uuid=%.*s")
+
+
+def carries(dictionary: Dictionary, response: str) -> bool:
+    """Return whether the firmware has RESPONSE, a format; its numbers may have other sizes.
+
+    More parameters do not matter.
+    """
+    name, *params = response.split(" ")
+    found = dictionary.responses.get(name)
+    if found is None:
         return False
-    codes = dict(zip(format_.names, format_.code_texts, strict=True))
-    return codes.get("canbus_uuid", "").endswith("s")
-
-
-def _carries(dictionary: Dictionary, name: str, params: tuple[str, ...]) -> bool:
-    found = dictionary.responses[name]
     codes = dict(zip(found.names, found.code_texts, strict=True))
-    return all(not codes.get(param, "s").endswith("s") for param in params)
+    wanted = dict(param.split("=") for param in params)
+    return all(
+        param in codes and codes[param].endswith("s") == code.endswith("s") for param, code in wanted.items()
+    )
 
 
-def _unusable(dictionary: Dictionary, kind: str, name: str, params: tuple[str, ...]) -> DictionaryError:
-    wanted = " ".join((name, *params))
+def _unusable(dictionary: Dictionary, kind: str, wanted: str) -> DictionaryError:
     return DictionaryError(f"firmware {dictionary.version!r} has no {kind} {wanted!r} and cannot be driven")

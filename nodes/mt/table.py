@@ -15,6 +15,10 @@ from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.errors import NodeError
 
 COMMANDS: Final = ("config_table", "table_query", "table_bytes", "table_activate", "table_query_active")
+RESPONSES: Final = (
+    "table_state oid=%c table_status=%c generation=%u length=%hu checksum=%u digest=%u words=%u",
+    "table_active oid=%c table_activation=%c generation=%u length=%hu clock=%u",
+)
 CONSTANT: Final = "MT_AXLES"
 """Constant of the dictionary: the firmware keeps tables; its value is how many axles a mask can select."""
 CAPACITY_MAX: Final = 0xFFFF
@@ -112,7 +116,7 @@ class AxleTable(Device):
 
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG, after its stepper; NodeConfigError when firmware keeps no tables."""
-        config.require(self.name, COMMANDS)
+        config.require(self.name, COMMANDS, RESPONSES)
         stepper_oid = _NO_STEPPER if self._stepper is None else self._stepper.oid
         assert stepper_oid is not None
         self.oid = config.create_oid()

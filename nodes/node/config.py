@@ -6,6 +6,7 @@ from typing import Final
 
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import MessageError
+from nodes.dictionary.vocabulary import carries
 from nodes.support.errors import CanductorError
 
 MAX_OIDS: Final = 255
@@ -35,9 +36,13 @@ class NodeConfig:
         self.oid_count += 1
         return self.oid_count - 1
 
-    def require(self, feature: str, commands: Iterable[str]) -> None:
-        """Raise NodeConfigError naming the commands that FEATURE needs and the firmware lacks."""
+    def require(self, feature: str, commands: Iterable[str], responses: Iterable[str] = ()) -> None:
+        """Raise NodeConfigError naming what FEATURE needs and the firmware lacks.
+
+        RESPONSES are formats; see ``carries``.
+        """
         missing = [name for name in commands if name not in self.dictionary.commands]
+        missing += [f"response '{text}'" for text in responses if not carries(self.dictionary, text)]
         if missing:
             raise NodeConfigError(
                 f"{feature} cannot work on node {self.name}: its firmware ({self.dictionary.version}) has no "

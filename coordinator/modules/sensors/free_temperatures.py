@@ -28,6 +28,7 @@ from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest_or_all, shown
 from nodes.devices.analog_in import AnalogIn, AnalogValue
+from nodes.dictionary.vocabulary import carries
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.node import Node
 from nodes.node.states import NodeState
@@ -42,6 +43,7 @@ CHIP_PIN: Final = "ADC_TEMPERATURE"
 HOST_S: Final = 1.0
 COMBINED_S: Final = 0.3
 HALF_WORD: Final = 1
+READ_RESPONSE: Final = "debug_result val=%u"
 
 
 class ChipTemperature(TemperatureSource):
@@ -95,7 +97,8 @@ class ChipTemperature(TemperatureSource):
         if node.state is not NodeState.READY:
             return
         factory = None if self._chip is None else self._chip.factory
-        if self._own is None and factory is not None and "debug_read" in node.dictionary.commands:
+        can_read = "debug_read" in node.dictionary.commands and carries(node.dictionary, READ_RESPONSE)
+        if self._own is None and factory is not None and can_read:
             await self._correct(node, factory)
         if self.celsius is None:
             await self.next()

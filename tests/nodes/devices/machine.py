@@ -16,8 +16,11 @@ from tests.nodes.virtual.world.machines import start_io, uuid
 HZ = 168_000_000
 
 
-class Device(Protocol):
+class Configured(Protocol):
     def configure(self, config: NodeConfig) -> None: ...
+
+
+class Device(Configured, Protocol):
     def started(self, node: Node) -> None: ...
 
 
