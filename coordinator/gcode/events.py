@@ -51,7 +51,7 @@ class Done:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """A piece of the program was read."""
+    """A piece of the program was read, or some of its lines."""
 
     line: int
     done_bytes: int

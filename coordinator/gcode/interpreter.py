@@ -57,6 +57,11 @@ MAX_NOTICES = 100
 """Different notices a job gives; a file of garbage must not flood the screen."""
 MAX_DEPTH = 30
 """Commands that stand in for a command that stands in for a command ..."""
+MAX_LINES = 100_000
+"""Lines that take the place of one line of the program, with all those that take the place of these."""
+LINES_AT_ONCE = 50
+"""Lines, but for those read in C, after which ``step`` returns, event or not. One that others replace counts
+as all of them: its template may have taken a while to be rendered."""
 MAX_PLACES = 4
 """Of such commands that a message names all; of more, it names the outermost and the innermost one."""
 
@@ -141,6 +146,10 @@ class Job(ProgramContext):
         self._breaks = False
         self._events: deque[Event] = deque()
         self._inner: list[_Inner | _Phase] = []
+        self._inner_lines = 0
+        """Done of those that take the place of the present line."""
+        self._left = 0
+        """Lines that the present ``step`` may still read."""
         self._action: StandstillAction | None = None
         self._over: Event | GCodeError | None = None
         self._noticed: set[str] = set()
@@ -162,14 +171,18 @@ class Job(ProgramContext):
         return self.planner.lines + 1
 
     def step(self) -> Event:
-        """Work until there is an event; at most one piece of the program (64 KiB).
+        """Work until there is an event; at most one piece of the program (64 KiB), and LINES_AT_ONCE.
 
         Waits for input only where the program's source does (pipes, standard input).
         """
+        self._left = LINES_AT_ONCE
         while not self._events:
             if self._breaks and self.at_line:
                 self._breaks = False
                 return self._progress()
+            if self._left <= 0:
+                return self._progress()
+            self._left -= 1
             if isinstance(self._over, GCodeError):
                 raise self._over.with_traceback(None)
             if self._over is not None:
@@ -297,6 +310,10 @@ class Job(ProgramContext):
             self._refused(feed)
             return
         inner.start = end + 1
+        self._inner_lines += 1
+        if self._inner_lines > MAX_LINES:
+            name = self._inner[0].name
+            raise self._error(f"{name} stands for more than {MAX_LINES:,} lines; let there be fewer")
 
     def _advance_phase(self, phase: _Phase) -> None:
         try:
@@ -327,7 +344,10 @@ class Job(ProgramContext):
 
     def _inner_done(self) -> None:
         done = self._inner.pop()
-        if not self._inner and not (isinstance(done, _Inner) and done.comes_before):
+        if self._inner:
+            return
+        self._inner_lines = 0
+        if not (isinstance(done, _Inner) and done.comes_before):
             self.planner.line_done()
 
     def _do(self, line: bytes, hint: str = "") -> bool:
@@ -444,6 +464,7 @@ class Job(ProgramContext):
                 self._reply(reading.replies)
                 data = reading.text.encode(errors="replace")
                 self._inner.append(_Inner(command.name, data, where=reading.where))
+                self._left = 0
             case Phases():
                 self._check_depth(command)
                 self._inner.append(_Phase(command, reading.run(self)))

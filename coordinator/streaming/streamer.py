@@ -202,7 +202,7 @@ class Streamer:
                 self._note_delay(cycle, self.print_time_now() - began_s)
                 if isinstance(event, StandstillAction):
                     await self._attend(event)
-                if event is not None or self.held is not None:
+                if (event is not None and not cycle.more) or self.held is not None:
                     await self._pause_for(self._cycle_s(cycle))
             self.ended_s = self._job.planner.print_time_end_s
             await self._settle(thread)

@@ -43,6 +43,8 @@ RUN_DRY_S: Final = 0.8
 REST_BORDER_S: Final = 0.15
 """At rest everything up to so far ahead of now counts as generated; below START_LEAD_S."""
 LINES_AT_ONCE: Final = 200
+READ_S: Final = 0.1
+"""G-code is read for so long in one cycle, and to the end of the step at hand: commands are due meanwhile."""
 OUTPUT_AT_ONCE: Final = 50
 """Replies and notices of one cycle: the control loop shows them in one turn."""
 OUTPUT_CHARS_AT_ONCE: Final = 65_536
@@ -61,6 +63,8 @@ class Cycle:
     due: list[Due]
     stepping: list[str]
     """Steppers that have steps in the batches."""
+    more: bool = False
+    """Whether lines of clients were left for the next cycle, which EVENT does not hold up."""
 
 
 class MotionWorker:
@@ -146,7 +150,7 @@ class MotionWorker:
         """Run the job as far as it should be by now, and make the commands that are due."""
         now = self.print_time_now()
         output: list[ProgramOutput] = []
-        event = waiting_for
+        event, more = waiting_for, False
         if 0 < self.steps.generated_until < now and self._planner.at_standstill:
             self._generate(now)  # after a long rest: clocks are steered from now on, not from the last cycle
         if self.pipeline.compensation_due and self._all_generated():
@@ -157,36 +161,43 @@ class MotionWorker:
             self._delay_after_standstill(now)
             event = self._advance(output)
         elif isinstance(waiting_for, StandstillAction) and not waiting_for.over:
-            event = self._attend_others(waiting_for, output)
+            event, more = self._attend_others(waiting_for, output)
+        now = self.print_time_now()  # lines may have taken a while
         if held or self._runs_dry(now):
             self._planner.flush()
         self._generate(now)
-        return self._cycle(output, event)
+        return self._cycle(output, event, more=more)
 
-    def _attend_others(self, resting: StandstillAction, output: list[ProgramOutput]) -> Event:
-        """Execute lines of clients while the job waits, maybe minutes; return what to wait for."""
+    def _attend_others(self, resting: StandstillAction, output: list[ProgramOutput]) -> tuple[Event, bool]:
+        """Execute lines of clients while the job waits, maybe minutes.
+
+        Returns what to wait for, and whether there are more.
+        """
+        ends_s = self.print_time_now() + READ_S
         while (event := self._job.attend_others()) is not None:
             if isinstance(event, Reply | Notice):
                 output.append(event)
             elif isinstance(event, Timed):
                 self.pipeline.at_next_move(event)
             elif isinstance(event, Emergency):
-                return event
-        return resting
+                return event, False
+            if self.print_time_now() >= ends_s:
+                return resting, True
+        return resting, False
 
     def rest(self) -> Cycle:
         """Make the commands that are due; the job is over."""
         self._generate(self.print_time_now())
         return self._cycle([], None)
 
-    def _cycle(self, output: Sequence[ProgramOutput], event: Event | None) -> Cycle:
+    def _cycle(self, output: Sequence[ProgramOutput], event: Event | None, *, more: bool = False) -> Cycle:
         batches, self._batches = self._batches, []
         due, self.pipeline.due = self.pipeline.due, []
         if self._compensation is not None:
             self._compensation.note(self.steps)
         steppers = self.steps.issued()
         stepping = self._stepping(steppers) if batches else []
-        return Cycle(batches, list(output), event, self._planned(steppers), due, stepping)
+        return Cycle(batches, list(output), event, self._planned(steppers), due, stepping, more)
 
     def _stepping(self, steppers: Sequence[Issued]) -> list[str]:
         """Return the steppers for which steps were made since the last time."""
@@ -247,8 +258,10 @@ class MotionWorker:
 
     def _advance(self, output: list[ProgramOutput]) -> Event | None:
         """Step the job until it has to wait for something, or as much as one cycle may have is done."""
-        chars = 0
+        chars, ends_s = 0, self.print_time_now() + READ_S
         for _ in range(LINES_AT_ONCE):
+            if self.print_time_now() >= ends_s:
+                return None
             event = self._job.step()
             if isinstance(event, Reply | Notice):
                 output.append(event)

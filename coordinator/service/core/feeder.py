@@ -98,7 +98,9 @@ class Feeder:
         self._waiting: deque[QueuedWork] = deque()
         self._interjections: deque[QueuedWork] = deque()
         self._interjection: QueuedWork | None = None
-        """That is being done, and has to wait for room."""
+        """That is being done, and goes on later."""
+        self._interjection_place: SuspendedProgram | None = None
+        """Where it goes on."""
         self._interjection_events: deque[Event] = deque()
         self._now: QueuedWork | None = None
         self._held: tuple[QueuedWork, SuspendedProgram] | None = None
@@ -202,9 +204,9 @@ class Feeder:
 
     def cancel_all(self) -> None:
         """End what is being done and what waits, each before its next line."""
-        now = self._now
-        for queued in (*self._waiting, *([now] if now is not None else [])):
-            self.cancel(queued)
+        for queued in (*self._waiting, *self._interjections, self._now, self._interjection):
+            if queued is not None:
+                self.cancel(queued)
 
     def close(self) -> None:
         """End: ``step`` answers End once all is planned."""
@@ -351,39 +353,47 @@ class Feeder:
         return queued.progress
 
     def _do_interjections(self) -> Event | None:
-        """Execute lines that neither move nor wait, return their events one by one; Full: one needs room."""
-        while self._interjection is not None or self._interjections:
+        """Execute some lines that neither move nor wait, return their events one by one.
+
+        Full: one needs room; Progress: there are more lines.
+        """
+        while not self._interjection_events and (self._interjection is not None or self._interjections):
             queued = self._interjection = self._interjection or self._interjections.popleft()
             suspended = self.planner.suspend_program(moving=False)
-            done = self._do_interjection(queued)
+            if self._interjection_place is not None:
+                self.planner.resume_program(self._interjection_place)
+            left = self._do_interjection(queued)
+            self._interjection_place = None if left is None else self.planner.suspend_program(moving=False)
             self.planner.resume_program(suspended)
-            if not done:
-                return Full()
+            if left is not None:
+                return left
             self._interjection = None
         return self._interjection_events.popleft() if self._interjection_events else None
 
-    def _do_interjection(self, queued: QueuedWork) -> bool:
-        """Go on with lines of a client; False: there is no room."""
+    def _do_interjection(self, queued: QueuedWork) -> Full | Progress | None:
+        """Go on with lines of a client by one step; Full: there is no room; Progress: there are more."""
         try:
             if queued.begun_at_s is None:
                 queued.begun_at_s = self.planner.print_time_end_s
                 queued.work.begin(self._setting)
             self._name = queued.work.name
-            while not isinstance(event := queued.work.step(), End | Emergency):
-                if isinstance(event, Full):
-                    return False
-                if isinstance(event, Reply | Notice):
-                    _keep(queued, event)
-                elif isinstance(event, Timed):  # it does not belong to any place among the work's moves
-                    self._interjection_events.append(replace(event, after_moves=AS_SOON_AS_POSSIBLE))
-            if isinstance(event, Emergency):
+            event = End(0, 0.0) if queued.cancelled else queued.work.step()
+            if isinstance(event, Full):
+                return event
+            if isinstance(event, Reply | Notice):
+                _keep(queued, event)
+            elif isinstance(event, Timed):  # it does not belong to any place among the work's moves
+                self._interjection_events.append(replace(event, after_moves=AS_SOON_AS_POSSIBLE))
+            elif isinstance(event, Emergency):
                 self._interjection_events.appendleft(event)
+            if not isinstance(event, End | Emergency):
+                return queued.work.progress()
         except CanductorError as error:
             queued.error = error
         queued.read = True
         queued.ends_at_s = 0.0
         self.finished.append(queued)
-        return True
+        return None
 
     # ------------------------------------------------- for programs (PrintControl)
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
+from coordinator.gcode import interpreter
 from coordinator.gcode.commands import (
     AtStandstill,
     Call,
@@ -27,7 +28,7 @@ from coordinator.gcode.events import (
     StandstillAction,
     Timed,
 )
-from coordinator.gcode.interpreter import MAX_DEPTH, Job
+from coordinator.gcode.interpreter import LINES_AT_ONCE, MAX_DEPTH, Job
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import Planner
@@ -152,6 +153,32 @@ def test_moves_within_lines_are_refused_like_others() -> None:
 def test_lines_that_stand_for_themselves_end() -> None:
     with pytest.raises(GCodeError, match=rf"part\.gcode:1: .*GO calls itself, {MAX_DEPTH} levels deep"):
         events(job("GO", GO=Lines("GO")))
+
+
+@pytest.mark.parametrize(("text", "ticks"), [("TICK\n" * 1000, 1000), ("MANY", 1000), ("TWICE\n" * 100, 200)])
+def test_lines_without_an_event_are_read_in_portions(text: str, ticks: int) -> None:
+    """Failed before: one call read all of them, for hours where macros call one another twice."""
+    read = 0
+
+    def count() -> None:
+        nonlocal read
+        read += 1
+
+    work = job(text, TICK=Immediate(act=count), MANY=Lines("TICK\n" * 1000), TWICE=Lines("TICK\nTICK"))
+    portions, before = [], 0
+    while not isinstance(work.step(), End):
+        portions.append(read - before)
+        before = read
+    assert read == ticks
+    # A template that was rendered may have taken its time: nothing follows in the same call.
+    assert 0 < max(portions) <= (2 if ticks == 200 else LINES_AT_ONCE)
+
+
+def test_lines_that_stand_for_ever_more_lines_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interpreter, "MAX_LINES", 1_000)
+    work = job("G28", "FEW", "FEW", "GO", FEW=Lines("G90\n" * 600), GO=Lines("FEW\n" * 3))
+    with pytest.raises(GCodeError, match=r"^part\.gcode:4: GO:2: FEW:399: GO stands for more than 1,000"):
+        events(work)
 
 
 def test_callers_are_known() -> None:

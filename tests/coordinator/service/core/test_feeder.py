@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.gcode.commands import GCodeCommand, Immediate, Vocabulary
-from coordinator.gcode.events import Emergency, End, Event, Full, Idle, PositionSet, Reply
+from coordinator.gcode.events import Emergency, End, Event, Full, Idle, PositionSet, Progress, Reply
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import Planner
@@ -157,7 +157,7 @@ def test_pause_reads_no_line_and_resume_the_next_one(feeder: Feeder) -> None:
     assert isinstance(feeder.step(), Idle)
     feeder.submit_interjection(LinesWork(["M114", "M220 S50"]))
     lines = feeder.planner.lines
-    assert isinstance(feeder.step(), Idle)
+    assert isinstance(drive(feeder)[-1], Idle)
     (aside,) = finished(feeder)
     assert [output.text[:2] for output in aside.output] == ["X:"]
     assert feeder.planner.speed_factor == 0.5
@@ -169,6 +169,35 @@ def test_pause_reads_no_line_and_resume_the_next_one(feeder: Feeder) -> None:
     assert finished(feeder) == [job]
     assert job.error is None
     assert feeder.planner.toolhead_position[0] == 81.0
+
+
+def test_a_long_interjection_is_done_in_portions(feeder: Feeder) -> None:
+    """Failed before: all of it in one call, however long, and also when its client had gone."""
+    job = feeder.submit(file_of("G28", "G1 X10 F6000", "G1 X20", "M114"), is_job=True)
+    asked, other = (
+        feeder.submit_interjection(LinesWork([*["M220 S50"] * 200, last], while_printing=True))
+        for last in ("M220 S70", "G1 X5")
+    )
+    while feeder.planner.speed_factor == 1:
+        assert isinstance(feeder.step(), Progress)
+    assert not asked.read
+    feeder.cancel(asked)
+    drive(feeder)
+    assert finished(feeder) == [asked, other, job]
+    assert feeder.planner.speed_factor == 0.5
+    # The lines of both are counted by themselves, and what is read in C for the job is not for the other.
+    assert str(other.error).startswith("client:201: G1 cannot run while a job prints")
+    assert job.error is None
+    assert [output.text for output in job.output[-1:]] == ["X:20.000 Y:0.000 Z:0.000 E:0.000"]
+
+
+def test_at_the_end_no_line_of_an_interjection_is_waited_for(feeder: Feeder) -> None:
+    begun, waiting = (feeder.submit_interjection(LinesWork(["M220 S50"] * 200)) for _ in range(2))
+    feeder.step()
+    feeder.cancel_all()
+    feeder.close()
+    assert len(drive(feeder)) < 4
+    assert finished(feeder) == [begun, waiting]
 
 
 def test_cancel_ends_before_the_next_line_also_while_paused(feeder: Feeder) -> None:
