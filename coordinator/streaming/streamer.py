@@ -178,7 +178,7 @@ class Streamer:
     # ------------------------------------------------------------------------------------------- streaming
 
     async def _stream(self) -> None:
-        with WorkThread("motion") as thread:
+        async with WorkThread("motion") as thread:
             event: Event | None = None
             while not isinstance(event, End):
                 self._called = False

@@ -22,7 +22,7 @@ class ThreadlessLoop(ABC):
 
 
 class WorkThread:
-    """The thread NAME, from its first work for the running loop to the end of a ``with`` block.
+    """The thread NAME, from its first work for the running loop to the end of an ``async with`` block.
 
     A ThreadPoolExecutor's futures are made for waiters in any thread; here only the loop waits, and it rests
     right after a hand-over, so that the two do not fight for the interpreter lock.
@@ -34,16 +34,27 @@ class WorkThread:
         self._threadless = self._loop if isinstance(self._loop, ThreadlessLoop) else None
         self._waiting: SimpleQueue[_Work | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
+        self._ended: Final[asyncio.Future[None]] = self._loop.create_future()
 
-    def __enter__(self) -> Self:
+    async def __aenter__(self) -> Self:
         return self
 
-    def __exit__(
+    async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._thread is not None:
-            self._waiting.put(None)
-            self._thread.join()
+        """Wait for the thread's end, also when cancelled meanwhile: nothing of it goes on afterwards."""
+        if self._thread is None:
+            return
+        self._waiting.put(None)
+        cancelled: asyncio.CancelledError | None = None
+        while not self._ended.done():
+            try:
+                await asyncio.wait((self._ended,))
+            except asyncio.CancelledError as again:
+                cancelled = again
+        self._thread.join()  # it has nothing left to do
+        if cancelled is not None:
+            raise cancelled
 
     async def run(self, call: Callable[[*Ts], T], *args: *Ts) -> T:
         """Return what CALL returns in the thread, or raise what it raises.
@@ -73,6 +84,7 @@ class WorkThread:
                 failure = error
             self._loop.call_soon_threadsafe(_settle, done, result, failure)
             del work, call, args, done, result, failure  # nothing is kept until the next work comes
+        self._loop.call_soon_threadsafe(self._ended.set_result, None)
 
 
 def _settle(done: "asyncio.Future[Any]", result: object, failure: BaseException | None) -> None:

@@ -12,7 +12,7 @@ from tests.stages import jump_loop
 
 def test_all_work_is_done_in_one_thread_which_ends_with_the_block() -> None:
     async def main() -> tuple[threading.Thread, list[threading.Thread]]:
-        with WorkThread("motion") as thread:
+        async with WorkThread("motion") as thread:
             done_in = [await thread.run(threading.current_thread) for _ in range(3)]
             assert await thread.run(divmod, 7, 4) == (1, 3)
         return threading.current_thread(), done_in
@@ -29,7 +29,7 @@ def test_what_the_work_raises_is_raised_and_the_thread_goes_on() -> None:
         raise CanductorError("it was in vain")
 
     async def main() -> int:
-        with WorkThread("motion") as thread:
+        async with WorkThread("motion") as thread:
             with pytest.raises(CanductorError, match="it was in vain"):
                 await thread.run(fail)
             return await thread.run(abs, -4)
@@ -40,8 +40,9 @@ def test_what_the_work_raises_is_raised_and_the_thread_goes_on() -> None:
 def test_an_exception_that_no_future_carries_hangs_nobody() -> None:
     async def main() -> None:
         failure = pytest.raises(RuntimeError, match="motion: StopIteration was not caught")
-        with WorkThread("motion") as thread, failure:
-            await thread.run(next, iter(()))
+        async with WorkThread("motion") as thread:
+            with failure:
+                await thread.run(next, iter(()))
 
     asyncio.run(main())
 
@@ -56,7 +57,7 @@ def test_a_block_that_is_left_waits_for_work_that_was_begun() -> None:
         finished.append(True)
 
     async def main() -> None:
-        with WorkThread("motion") as thread:
+        async with WorkThread("motion") as thread:
             waiting = asyncio.ensure_future(thread.run(work))
             await asyncio.to_thread(begun.wait)
             waiting.cancel()
@@ -68,10 +69,39 @@ def test_a_block_that_is_left_waits_for_work_that_was_begun() -> None:
     asyncio.run(main())
 
 
+def test_the_loop_goes_on_while_the_end_of_the_work_is_waited_for() -> None:
+    """Failed before: the loop was blocked until then, also by a work that only the loop could end."""
+    begun, go_on = threading.Event(), threading.Event()
+    finished = []
+
+    def work() -> None:
+        begun.set()
+        go_on.wait()
+        finished.append(True)
+
+    async def block() -> None:
+        async with WorkThread("motion") as thread:
+            await thread.run(work)
+
+    async def main() -> None:
+        leaving = asyncio.ensure_future(block())
+        await asyncio.to_thread(begun.wait)
+        for _ in range(3):  # also one that is cancelled again leaves no work behind
+            leaving.cancel()
+            await asyncio.sleep(0)
+        assert not leaving.done()
+        go_on.set()
+        with pytest.raises(asyncio.CancelledError):
+            await leaving
+        assert finished == [True]
+
+    asyncio.run(main())
+
+
 def test_without_work_there_is_no_thread() -> None:
     async def main() -> None:
         before = threading.active_count()
-        with WorkThread("motion"):
+        async with WorkThread("motion"):
             assert threading.active_count() == before
 
     asyncio.run(main())
@@ -79,7 +109,7 @@ def test_without_work_there_is_no_thread() -> None:
 
 def test_a_loop_without_threads_does_it_itself() -> None:
     async def main() -> None:
-        with WorkThread("motion") as thread:
+        async with WorkThread("motion") as thread:
             assert await thread.run(threading.current_thread) is threading.current_thread()
             with pytest.raises(ZeroDivisionError):
                 await thread.run(divmod, 1, 0)
