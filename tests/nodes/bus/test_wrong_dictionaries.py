@@ -93,7 +93,7 @@ def test_a_sync_pulse_that_is_answered_without_its_number_fails_the_node_alone()
     responses = source_of()["responses"] | {"sync_pulse clock=%u": 99}
     pair = Pair(firmware(responses=responses))
     pair.start_and_stop()
-    assert "has no response 'sync_pulse seq clock' and cannot be driven" in str(pair.fan.failure)
+    assert "has no response 'sync_pulse seq=%c clock=%u' and cannot be driven" in str(pair.fan.failure)
 
 
 def test_a_bug_in_building_a_configuration_fails_its_node_alone_and_is_reported() -> None:
