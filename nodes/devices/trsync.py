@@ -1,5 +1,6 @@
 """Stop groups on a node (trsync): steppers that stop when a trigger occurs anywhere on the machine."""
 
+import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -10,13 +11,14 @@ from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
 from nodes.node.node import Node
-from nodes.node.request_reply import QUERY_TRIES
 
 COMMANDS: Final = ("config_trsync", "trsync_start", "trsync_set_timeout", "trsync_trigger")
 RESPONSES: Final = ("trsync_state oid=%c can_trigger=%c trigger_reason=%c clock=%u",)
 GROUPS_CONSTANT: Final = "CAN_TRIGGER_GROUPS"
 """Constant of the dictionary: number of trigger groups of the firmware; other firmware has none."""
 NO_GROUP: Final = 255
+END_S: Final = 3.0
+"""A node that is not lost has received a command long before."""
 
 
 class TriggerReason(IntEnum):
@@ -98,17 +100,19 @@ class Trsync(Device):
     async def finish(self, node: Node) -> TrsyncState:
         """End the homing move and return how it ended; trigger it unless it has triggered.
 
-        Raises NodeError when NODE does not say that it has, and as ``Node.query`` does.
+        Raises NodeError when NODE does not say within END_S that it has, and as ``Node.query`` does.
         """
-        for _ in range(QUERY_TRIES):
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + END_S
+        while loop.time() < end_s:
             answer = await node.query(
                 "trsync_trigger", "trsync_state", oid=self._oid, reason=int(TriggerReason.HOST)
             )
-            # An earlier report, delayed by a repeated block, looks like the answer.
+            # A report that the node makes before the command has arrived looks like the answer.
             if not (state := _state(answer)).armed:
                 return state
         raise NodeError(
-            f"{self.description} has not triggered, though node {node.name} was told to {QUERY_TRIES} times;"
+            f"{self.description} has not triggered, though node {node.name} was told to for {END_S:g} s;"
             " restart the machine, and flash the node's firmware again if this comes again"
         )
 

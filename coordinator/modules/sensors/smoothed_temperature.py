@@ -2,7 +2,7 @@
 
 from typing import ClassVar, Final
 
-from coordinator.config.options import FloatOption
+from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.modules.base import Build
 from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
 from coordinator.support.low_pass import LowPass
@@ -27,6 +27,7 @@ SMOOTH_TIME: Final = FloatOption(
 class SmoothedTemperature(TemperatureSensor):
     """A sensor by whose temperature something is corrected; it has SMOOTH_TIME among its options."""
 
+    SPEC: ClassVar = SectionSpec(help="", options=())
     PLAUSIBLE: ClassVar = (COLDEST_C, HOTTEST_C)
 
     def __init__(self, build: Build) -> None:
