@@ -26,7 +26,7 @@ from nodes.support.regular_file import read_regular
 FILENAME = TextOption(name="filename", help="The file, relative to that of the configuration; ~ is your home")
 VARIABLES_MAX: Final = 1000
 FILE_BYTES_MAX: Final = 1_000_000
-_HEADER: Final = "[Variables]"
+_HEADER: Final = b"[Variables]\n"
 
 
 class SaveVariables(Module):
@@ -38,9 +38,10 @@ class SaveVariables(Module):
         super().__init__(build)
         self.path = build.path(FILENAME)
         self._place = build.reader.place_of(FILENAME)
-        self._variables: dict[str, Any] = {}
+        self._lines: dict[str, bytes] = {}
+        """Of the file, by variable."""
         self._shown: dict[str, Value] = {}
-        """The same, as the status has them."""
+        """The values, as the status has them."""
         self._files = FileWriter()
         build.add_command(
             "SAVE_VARIABLE", "Save VALUE as VARIABLE in the file", self._save, while_printing=True
@@ -51,12 +52,11 @@ class SaveVariables(Module):
         self._files = modules.files
         try:
             unwritten = self._files.unwritten(self.path)
-            self._variables = (
-                read_variables(self.path) if unwritten is None else _variables_in(self.path, unwritten)
-            )
+            found = read_variables(self.path) if unwritten is None else _variables_in(self.path, unwritten)
         except CanductorError as error:
             raise ConfigError(self._place, str(error)) from None
-        self._shown = {name: plain(value) for name, value in self._variables.items()}
+        self._lines = {name: _line(name, value) for name, value in found.items()}
+        self._shown = {name: plain(value) for name, value in found.items()}
 
     def status(self) -> Mapping[str, Value]:
         """Report the values."""
@@ -68,7 +68,7 @@ class SaveVariables(Module):
         if not name.isidentifier() or not name.isascii():
             raise WordError(f"VARIABLE of SAVE_VARIABLE is {quoted(name)}; write letters, digits and _")
         name = name.lower()
-        if name not in self._variables and len(self._variables) >= VARIABLES_MAX:
+        if name not in self._lines and len(self._lines) >= VARIABLES_MAX:
             raise WordError(f"{VARIABLES_MAX} variables are saved already; use one of their names again")
         try:
             value = literal(text)
@@ -80,16 +80,16 @@ class SaveVariables(Module):
         _check_readable(value)
 
         def act() -> None:
-            variables = {**self._variables, name: value}
-            text = _as_text(variables)
-            if len(text.encode()) > FILE_BYTES_MAX:
+            lines = {**self._lines, name: _line(name, value)}
+            if len(_HEADER) + sum(map(len, lines.values())) > FILE_BYTES_MAX:
                 raise WordError(
                     f"the file of variables has no room for {name}: {FILE_BYTES_MAX:,} bytes at most"
                 )
-            self._variables = variables
+            self._lines = lines
             self._shown[name] = plain(value)
             if self._live is not None:
-                self._files.write(self.path, text.encode(), self._fail)
+                data = _HEADER + b"".join(lines[each] for each in sorted(lines))
+                self._files.write(self.path, data, self._fail)
 
         return Immediate(act=act)
 
@@ -145,6 +145,5 @@ def _check_readable(value: object) -> None:
         raise WordError(f"VALUE of SAVE_VARIABLE, once it is written, {problem}") from None
 
 
-def _as_text(variables: Mapping[str, Any]) -> str:
-    lines = [f"{name} = {value!r}" for name, value in sorted(variables.items())]
-    return "\n".join([_HEADER, *lines, ""])
+def _line(name: str, value: object) -> bytes:
+    return f"{name} = {value!r}\n".encode()
