@@ -111,7 +111,9 @@ class TemperatureSource:
 
     def _watch(self, live: "ModuleContext", celsius: float) -> None:
         """Stop the machine when CELSIUS stays outside the limits: for sensors that no node checks."""
-        self._bad = 0 if not self.guarded or self.min_c <= celsius <= self.max_c else self._bad + 1
+        if not self.guarded:
+            return
+        self._bad = 0 if self.min_c <= celsius <= self.max_c else self._bad + 1
         if self._bad == BAD_IN_A_ROW:
             live.stop(
                 f"[{self.name}] reads {celsius:.0f} °C, outside its min_temp of {self.min_c:g} and max_temp"
