@@ -200,6 +200,23 @@ def test_at_the_end_no_line_of_an_interjection_is_waited_for(feeder: Feeder) -> 
     assert finished(feeder) == [begun, waiting]
 
 
+def test_a_pause_and_a_cancel_act_among_lines_without_an_event(feeder: Feeder) -> None:
+    """Failed before: all of the file's lines were read in one call."""
+    job = feeder.submit(file_of(*["G28", *["G90"] * 500, "G1 X10 F6000"]), is_job=True)
+    while feeder.planner.lines < 10:
+        feeder.step()
+    feeder.pause()
+    lines = feeder.planner.lines
+    assert isinstance(feeder.step(), Idle)
+    feeder.resume()
+    feeder.step()
+    feeder.cancel(job)
+    drive(feeder)
+    assert finished(feeder) == [job]
+    assert lines < feeder.planner.lines < 200
+    assert feeder.planner.moves == 0
+
+
 def test_cancel_ends_before_the_next_line_also_while_paused(feeder: Feeder) -> None:
     feeder.planner.plan_until_s = 0.5
     job = feeder.submit(
