@@ -408,9 +408,8 @@ class IpcServer:
         self._connections.discard(connection)
         self._tcp.discard(connection)
         self._leaving[connection] = None
-        if (
-            len(self._leaving) > self._settings.connections_max
-        ):  # all can leave at once; the first had its turns then
+        if len(self._leaving) > self._settings.connections_max:
+            # All may leave in one round; who comes and leaves behind them takes rounds, in which these have turns.
             next(iter(self._leaving)).forget_rest()
 
     def _drop(self, connection: Connection) -> None:

@@ -227,7 +227,7 @@ class StopLane:
     # ---- On the loop, or in the lane's thread ----
 
     def goes_on(self) -> bool:
-        """Return whether the finder that is asked has time: the loop does not wait, or wants to know it."""
+        """Return whether the finder that is asked may take longer; not if the loop could read by itself."""
         return self._goes_on()
 
     def _is_alone(self) -> bool:
