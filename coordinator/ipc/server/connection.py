@@ -100,6 +100,12 @@ class Connection(asyncio.BufferedProtocol):
             return
         self._linger = self._loop.call_later(HANG_UP_CHECK_S, self._check_hang_up)
 
+    def notify(self, event: str, data: bytes) -> None:
+        """Send DATA, the notification EVENT as this client writes, in its turn of a round to come."""
+        self.session.notify(event, data)
+        if not self.transport.is_closing():
+            self._scheduler.request_later(self)
+
     def pause_writing(self) -> None:
         """Stop sending: the client does not read."""
         self.session.writable = False

@@ -54,6 +54,12 @@ class FairScheduler:
         self._expect_round()
         worker.pause()
 
+    def request_later(self, worker: Worker) -> None:
+        """Let WORKER work in a round to come: who calls this is not to be interrupted by what it does."""
+        if worker not in self._urgent:
+            self._waiting[worker] = None
+        self._expect_round()
+
     def remove(self, worker: Worker) -> None:
         """Forget WORKER."""
         self._waiting.pop(worker, None)

@@ -149,21 +149,21 @@ class IpcServer:
         await asyncio.sleep(0)
 
     def notify(self, event: str, values: Mapping[str, Value]) -> None:
-        """Send EVENT ("log", "gcode.reply") to every client that listens to it; never blocks."""
+        """Send EVENT ("log", "gcode.reply") to every client that listens to it; nothing is sent in here."""
         message: dict[str, Value] = {"event": event, "values": dict(values)}
         encoded: dict[Encoding, bytes] = {}
         for connection in self._connections:
             session = connection.session
             if not session.listens.matches(event):
                 continue
-            if session.encoding not in encoded:
+            encoding = session.encoding
+            if (data := encoded.get(encoding)) is None:
                 try:
-                    encoded[session.encoding] = self._encoder.message(session.encoding, message)
+                    data = encoded[encoding] = self._encoder.message(encoding, message)
                 except ValueError:  # who notifies has other things to do than to fail for this
                     self._unsendable += 1
                     return
-            session.notify(event, encoded[session.encoding])
-            connection.flush()
+            connection.notify(event, data)
 
     def figures(self) -> dict[str, Value]:
         """Return how many clients there are, and the counters of all messages since the start."""

@@ -128,6 +128,23 @@ def test_an_urgent_client_is_ahead_and_the_others_get_on() -> None:
     asyncio.run(body())
 
 
+def test_who_has_time_works_in_a_round_to_come() -> None:
+    """However often it is requested, once; its caller goes on before."""
+
+    async def body() -> None:
+        clock, worked = Clock(), list[str]()
+        scheduler = FairScheduler(clock)
+        clients = [Client(name, 1, clock, worked) for name in "abcdef"]
+        for client in clients * 2:
+            scheduler.request_later(client)
+        scheduler.request_turn(clients[-1], urgent=True)
+        scheduler.request_later(clients[-1])
+        assert await rounds(worked) == [[], ["f", "a", "b", "c"], ["d", "e"]]
+        assert [client.held for client in clients] == [0] * 5 + [1]
+
+    asyncio.run(body())
+
+
 class BrokenClient(Client):
     def work(self, until_s: float) -> bool:
         super().work(until_s)

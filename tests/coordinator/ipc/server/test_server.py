@@ -10,6 +10,7 @@ import msgpack
 import pytest
 
 from coordinator.ipc.protocol.limits import Limits
+from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Scope
 from coordinator.ipc.server.connection import UNREAD_BYTES
 from coordinator.ipc.server.fair_scheduler import ROUND_S, TURN_S
 from coordinator.ipc.server.session import MESSAGES_PER_TURN, PHASES
@@ -170,6 +171,60 @@ def test_updates_that_are_due_at_one_instant_do_not_fill_one_round(tmp_path: Pat
         assert most <= ROUND_S / TURN_S + 1
 
     run(tmp_path, body, look_s=TURN_S)  # one update takes a whole turn
+
+
+def test_lines_for_many_who_listen_do_not_fill_one_round(tmp_path: Path) -> None:
+    """Failed before: each line was sent to each of them at once, 50 lines for 250 in 0.14 s."""
+
+    async def body(served: Served) -> None:
+        scripts = [await served.script() for _ in range(64)]
+        for script in scripts:
+            await script.ask("api.listen", events=["log"])
+        sessions = [connection.session for connection in served.server._connections]
+        before = [session.counters.bytes_out for session in sessions]
+
+        def count_new() -> int:
+            """Return to how many something was sent since this was asked last."""
+            now = [session.counters.bytes_out for session in sessions]
+            new = sum(map(int.__ne__, now, before))
+            before[:] = now
+            return new
+
+        for number in range(50):
+            served.server.notify("log", {"number": number})
+        while (new := count_new()) or served.server._scheduler._waiting:  # type: ignore[union-attr]
+            assert new <= ROUND_S / TURN_S
+            await asyncio.sleep(0)
+        for script in scripts:
+            received = [await script.receive() for _ in range(50)]
+            assert [message["values"]["number"] for message in received] == list(range(50))
+
+    run(tmp_path, body, look_s=TURN_S)  # one turn takes all of its time
+
+
+def test_what_a_request_has_others_told_comes_in_order(tmp_path: Path) -> None:
+    """A turn does not begin within another one, neither of the client that is at work nor of others."""
+
+    async def body(served: Served) -> None:
+        def say(_: Caller, params: dict[str, Any]) -> None:
+            served.server.notify("log", params)
+
+        number = Param("number", Kind.INT)
+        served.server._context.registry.add(Method("say", Scope.WATCH, "Say it.", say, (number,)))
+        speaking, listening = await served.script(), await served.script()
+        for script in (speaking, listening):
+            await script.ask("api.listen", events=["log"])
+        for script in (speaking, listening):
+            for request_id in range(2 * MESSAGES_PER_TURN):
+                script.send("say", request_id, number=request_id)
+        for script in (speaking, listening):
+            received = [await script.receive() for _ in range(6 * MESSAGES_PER_TURN)]
+            answers = [message["id"] for message in received if "id" in message]
+            assert answers == list(range(2 * MESSAGES_PER_TURN))
+            said = [message["values"]["number"] for message in received if "event" in message]
+            assert sorted(said) == sorted(2 * answers)
+
+    run(tmp_path, body)
 
 
 def test_a_client_that_has_said_all_and_reads_late_is_disconnected_once(
