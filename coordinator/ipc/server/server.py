@@ -409,7 +409,7 @@ class IpcServer:
         self._tcp.discard(connection)
         self._leaving[connection] = None
         if len(self._leaving) > self._settings.connections_max:
-            # All may leave in one round; who comes and leaves behind them takes rounds, in which these have turns.
+            # All may leave in one round. Who comes and leaves behind them takes rounds, and these have turns.
             next(iter(self._leaving)).forget_rest()
 
     def _drop(self, connection: Connection) -> None:
