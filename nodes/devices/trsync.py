@@ -112,7 +112,7 @@ class Trsync(Device):
             if not (state := _state(answer)).armed:
                 return state
         raise NodeError(
-            f"{self.description} has not triggered, though node {node.name} was told to for {END_S:g} s;"
+            f"{self.description} did not stop, though node {node.name} was sent the trigger for {END_S:g} s;"
             " restart the machine, and flash the node's firmware again if this comes again"
         )
 

@@ -231,7 +231,7 @@ class Session:
         """Return who stops the machine with what waits here and with the UNREAD bytes behind it; else None.
 
         In any thread; the session stays as it is. A twin of it reads the messages that may be a stop, so that
-        rights are the same; after each turn's worth of them GOES_ON tells whether there is time for more.
+        rights are the same; after each ``read`` of it GOES_ON returns whether there is time for more.
         """
         if self.end_reason is not None or not (unread or self._reader.waiting_bytes):
             return None

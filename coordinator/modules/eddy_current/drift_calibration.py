@@ -392,11 +392,11 @@ class DriftCalibration(Module):
             yield from self._complete(going_on)
             return
         going_on.next_c, going_on.asked = after_c + going_on.step_c, False
-        told = (
+        text = (
             f"sample {len(going_on.samples)} at {after_c:.1f} °C; the next begins at {going_on.next_c:.1f} °C"
             " or with TEMPERATURE_PROBE_NEXT; TEMPERATURE_PROBE_COMPLETE or ABORT end the calibration"
         )
-        yield Immediate((told,))
+        yield Immediate((text,))
 
     def _read_complete(self, call: Call) -> Reading:
         call.parameters()
@@ -420,7 +420,7 @@ class DriftCalibration(Module):
         if not drift.is_plausible(lowest_c, max(going_on.procedure.valid_c, going_on.warmest_c)):
             yield from self._end("the calibration is not kept: it is not plausible up to max_validation_temp")
             return
-        told = (
+        text = (
             f"{coil.name}: {len(going_on.samples)} samples from {lowest_c:.1f} to"
             f" {going_on.warmest_c:.1f} °C; SAVE_CONFIG writes them"
         )
@@ -428,15 +428,15 @@ class DriftCalibration(Module):
         async def keep() -> Done:
             heights_known = coil.keep(drift, lowest_c)
             more = "" if heights_known else "; now calibrate with PROBE_EDDY_CURRENT_CALIBRATE"
-            return Done((told + more,))
+            return Done((text + more,))
 
         yield AtStandstill(keep)
         yield from self._end("the calibration has ended")
 
-    def _end(self, told: str) -> Iterator[Reading]:
+    def _end(self, text: str) -> Iterator[Reading]:
         """End the calibration, with its heaters switched off."""
         self._switch_off()
-        yield Immediate((told,))
+        yield Immediate((text,))
 
     @contextmanager
     def _ending_early(self) -> Iterator[None]:

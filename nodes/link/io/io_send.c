@@ -38,7 +38,7 @@ static uint32_t put_frame(struct io_bus *bus, struct outlet *outlet, enum link_c
 }
 
 // They are few and bounded: no budget. A stop does not wait for room either, nor for the end of a pause: what
-// waits in the kernel is an estimate, from a bit rate that a node told.
+// waits in the kernel is an estimate, from a bit rate that a node reports.
 static void send_admin(struct io_bus *bus, struct outlet *outlet) {
     while (bus->admin_count) {
         const struct can_frame *frame = &bus->admin[bus->admin_first];

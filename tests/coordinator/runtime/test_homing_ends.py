@@ -1,4 +1,4 @@
-"""How a homing move ends when its nodes do not do what they are told."""
+"""How a homing move ends when its nodes do not carry out its commands."""
 
 import asyncio
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ ENDED = TrsyncState(armed=False, reason=TriggerReason.ENDSTOP, clock32=7)
 
 
 class Sync:
-    """A stop group that ends as it is told to: in a state, or with an error."""
+    """A stop group that ends as the test says: in a state, or with an error."""
 
     def __init__(self, end: TrsyncState | CanductorError) -> None:
         self.end = end
@@ -57,7 +57,7 @@ def test_it_says_why_it_is_not_known_how_a_node_ended() -> None:
 
 
 def test_a_node_whose_link_is_lost_keeps_no_other_from_being_stopped() -> None:
-    """A moment before the loop learns of it the node still counts as one that can be told."""
+    """Before the loop is notified, the node still counts as one that takes commands."""
     lost, other = Sync(LinkError("can0 node 4: the link is lost")), Sync(ENDED)
     leg = leg_of(lost, other)
     move: Any = SimpleNamespace(_heard_s={}, _changed=asyncio.Event())

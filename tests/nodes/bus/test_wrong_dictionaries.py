@@ -23,7 +23,7 @@ STOPPING = source_of(config={"CLOCK_FREQ": 1_000_000, "CAN_BUS_STOP": 1})
 
 
 class Pair:
-    """A bus with a sound node and FAN, an optional one; what the bus said, and what the loop was told."""
+    """A bus with a sound node and FAN, an optional one; reports of the bus, exceptions of the loop."""
 
     def __init__(self, fan: TwinNode, build: BuildConfig | None = None) -> None:
         fan.uuid = uuid(2)

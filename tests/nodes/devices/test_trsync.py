@@ -50,7 +50,7 @@ def test_a_node_that_never_triggers_is_not_asked_for_ever() -> None:
     """Failed before: the homing that waited for it never ended."""
     node = node_that_is_armed_for(ENDLESS)
     with pytest.raises(
-        NodeError, match="for homing on node mcu has not triggered, though node mcu was told to for 3 s; "
+        NodeError, match="for homing on node mcu did not stop, though node mcu was sent the trigger for 3 s; "
     ):
         virtual_time.run(group().finish(node))
     assert node.asked == pytest.approx(END_S / REPORT_S, abs=1)

@@ -192,8 +192,8 @@ static void a_full_queue_is_waited_for_only_with_something_to_send(void) {
     io_free(scene.bus);
 }
 
-// What waits in the kernel is an estimate from a bit rate that a node told: a stop goes whatever that says,
-// and before the frames that were queued first.
+// What waits in the kernel is an estimate from a bit rate that a node reports: a stop goes whatever that
+// says, and before the frames that were queued first.
 static void a_stop_waits_neither_for_the_queue_nor_for_other_frames(void) {
     struct scene scene;
     static const uint8_t stop[6] = {0};

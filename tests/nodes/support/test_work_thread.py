@@ -47,37 +47,38 @@ def test_an_exception_that_no_future_carries_hangs_nobody() -> None:
     asyncio.run(main())
 
 
-def test_a_block_that_is_left_waits_for_work_that_was_begun() -> None:
-    begun, go_on = threading.Event(), threading.Event()
-    finished = []
+class Held:
+    """Work that goes on until the test lets it end."""
 
-    def work() -> None:
-        begun.set()
-        go_on.wait()
-        finished.append(True)
+    def __init__(self) -> None:
+        self.begun, self.go_on = threading.Event(), threading.Event()
+        self.finished = False
+
+    def __call__(self) -> None:
+        self.begun.set()
+        self.go_on.wait()
+        self.finished = True
+
+
+def test_a_block_that_is_left_waits_for_work_that_was_begun() -> None:
+    work = Held()
 
     async def main() -> None:
         async with WorkThread("motion") as thread:
             waiting = asyncio.ensure_future(thread.run(work))
-            await asyncio.to_thread(begun.wait)
+            await asyncio.to_thread(work.begun.wait)
             waiting.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await waiting
-            go_on.set()
-        assert finished == [True]
+            work.go_on.set()
+        assert work.finished
 
     asyncio.run(main())
 
 
 def test_the_loop_goes_on_while_the_end_of_the_work_is_waited_for() -> None:
     """Failed before: the loop was blocked until then, also by a work that only the loop could end."""
-    begun, go_on = threading.Event(), threading.Event()
-    finished = []
-
-    def work() -> None:
-        begun.set()
-        go_on.wait()
-        finished.append(True)
+    work = Held()
 
     async def block() -> None:
         async with WorkThread("motion") as thread:
@@ -85,15 +86,15 @@ def test_the_loop_goes_on_while_the_end_of_the_work_is_waited_for() -> None:
 
     async def main() -> None:
         leaving = asyncio.ensure_future(block())
-        await asyncio.to_thread(begun.wait)
+        await asyncio.to_thread(work.begun.wait)
         for _ in range(3):  # also one that is cancelled again leaves no work behind
             leaving.cancel()
             await asyncio.sleep(0)
         assert not leaving.done()
-        go_on.set()
+        work.go_on.set()
         with pytest.raises(asyncio.CancelledError):
             await leaving
-        assert finished == [True]
+        assert work.finished
 
     asyncio.run(main())
 

@@ -54,8 +54,8 @@ def test_a_fan_whose_sensor_is_silent_runs_at_its_highest_speed(stage: HeatMachi
         await asyncio.sleep((SILENT_LOOKS + 2) * LOOK_S)
         assert stage.status(SIDE)["speed"] == 0.9
         await asyncio.sleep(5.0)
-        (told,) = [text for text in stage.notices if "highest speed" in text]
-        assert told.startswith(f"[{SIDE}] runs at its highest speed: its sensor is silent; check")
+        (notice,) = [text for text in stage.notices if "highest speed" in text]
+        assert notice.startswith(f"[{SIDE}] runs at its highest speed: its sensor is silent; check")
         await stage.do("SET_TEMPERATURE_FAN_TARGET TEMPERATURE_FAN=bed_side TARGET=0")
         await asyncio.sleep(2.0)
         assert stage.status(SIDE)["speed"] == 0
@@ -80,8 +80,8 @@ def test_a_fan_whose_measurements_cannot_be_handled_runs_at_its_highest_speed(st
         await asyncio.sleep((SILENT_LOOKS + 2) * LOOK_S)
         assert stage.status(SIDE)["speed"] == 0.9
         await asyncio.sleep(5.0)
-        (told,) = [text for text in stage.notices if "highest speed" in text]
-        assert told.endswith("its measurements cannot be handled; this is a bug, please report it")
+        (notice,) = [text for text in stage.notices if "highest speed" in text]
+        assert notice.endswith("its measurements cannot be handled; this is a bug, please report it")
 
     stage.connected(main)
 
