@@ -1,10 +1,10 @@
 """The journal of a job: up to which line it was carried out, so that this outlives whatever ends the service.
 
 One small file for each job folder, outside it: front ends list what is in there. Each entry is a line of
-JSON, appended by a thread of its own and brought to the disk every SYNC_S; a power cut costs the last entries
-and nothing else. A file beyond FILE_BYTES_MAX is written again with what still counts: its head and its
-newest entry. So is one whose last entry could not be written: half an entry must not spoil the next one. And
-so is one that somebody removed or changed meanwhile.
+JSON, appended by a thread of its own and brought to the disk every SYNC_S, at once if the head is about to
+go up or down; a power cut costs the last entries and nothing else. A file beyond FILE_BYTES_MAX is written
+again with what still counts: its head and its newest entry. So is one whose last entry could not be written:
+half an entry must not spoil the next one. And so is one that somebody removed or changed meanwhile.
 """
 
 import contextlib
@@ -190,6 +190,7 @@ class Journal:
         head: dict[str, Any] | None = None  # of the job that goes on
         size = FILE_BYTES_MAX  # an existing file is replaced
         unsynced_s: float | None = None  # since when
+        heights: object = None  # of the last entry: an old one that is found would be relied on
         while True:
             try:
                 found = self._waiting.get(timeout=None if unsynced_s is None else SYNC_S)
@@ -213,7 +214,8 @@ class Journal:
                 self._remove()  # what it says of an earlier job, or of this one, does not hold any more
             if over:
                 head = None
-            if unsynced_s is not None and at_s >= unsynced_s + SYNC_S:
+            before, heights = heights, entry.get("z")
+            if unsynced_s is not None and (at_s >= unsynced_s + SYNC_S or heights != before):
                 size, unsynced_s = self._sync(size), None
 
     def _write(self, head: dict[str, Any] | None, entry: dict[str, Any], size: int) -> int:

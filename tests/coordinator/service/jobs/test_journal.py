@@ -2,6 +2,7 @@
 
 import json
 import os
+import stat
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -150,3 +151,20 @@ def test_a_disk_that_cannot_be_written_is_told_once(tmp_path: Path) -> None:
     journal.close(None)
     assert len(told) == 1
     assert "no such file" in told[0]
+
+
+def test_new_heights_are_on_the_disk_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a power cut the disk had an old height, on which a job that goes on relied."""
+    path, synced = tmp_path / NAME, []
+
+    def fsync(fd: int) -> None:
+        if stat.S_ISREG(os.fstat(fd).st_mode) and (found := read_journal(path)) is not None:
+            synced.append((found.line, found.held["z"]))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    journal = Journal(path, pytest.fail, clock_s=lambda: 0.0)
+    journal.begin("part.gcode", 1000, 77)
+    for line, z in ((1, [0.2, 0.2]), (2, [0.2, 0.2]), (3, [0.2, 0.6]), (4, [0.2, 0.6]), (5, [0.4, 0.4])):
+        journal.note(line, {"z": z})
+    journal.close(None)
+    assert synced == [(1, [0.2, 0.2]), (3, [0.2, 0.6]), (5, [0.4, 0.4]), (5, [0.4, 0.4])]
