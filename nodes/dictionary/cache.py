@@ -12,7 +12,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -117,7 +117,8 @@ class DictionaryCache:
         key = self._addresses().get(address)
         if key is None:
             return None
-        self._read_folder(b"")
+        if key not in self._kept:
+            self._read_files(b"", (found for found in self._files() if found[1] == key))
         kept = self._kept.get(key)
         return None if kept is None else kept.dictionary
 
@@ -167,7 +168,11 @@ class DictionaryCache:
         if len(self._looked_for) >= MAX_KEPT:
             self._looked_for.clear()
         self._looked_for.add(beginning)
-        for path, key in self._files():
+        self._read_files(beginning, self._files())
+
+    def _read_files(self, beginning: bytes, files: Iterable[tuple[Path, str]]) -> None:
+        """Keep those of FILES (path, SHA-256) that begin like this."""
+        for path, key in files:
             compressed = None if key in self._kept else _read(path, beginning)
             if compressed is None:
                 continue

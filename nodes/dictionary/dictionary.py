@@ -20,10 +20,10 @@ from nodes.dictionary.parts import (
 )
 from nodes.support.plain_json import read_json
 
-MAX_INFLATED_BYTES: Final = 1 << 20
-"""Largest compressed size; real dictionaries have 10 to 13 kB."""
-MAX_COMPRESSED_BYTES: Final = 1 << 18
-"""Size at which a download is given up."""
+MAX_INFLATED_BYTES: Final = 1 << 16
+"""Real dictionaries have 8 to 13 kB. Here and in ``parts``: what the control loop has time to read."""
+MAX_COMPRESSED_BYTES: Final = 1 << 15
+"""Size at which a download is given up; real dictionaries have some 4 kB."""
 IDENTIFY: Final = "identify offset=%u count=%c"
 IDENTIFY_RESPONSE: Final = "identify_response offset=%u data=%.*s"
 _WORD: Final = re.compile(r'\s*([A-Za-z_]\w*)=("(?:[^"\\]|\\.)*"|\S*)')

@@ -18,7 +18,8 @@ Value = int | bytes
 
 CONTENT_MAX: Final[int] = lib.WIRE_CONTENT_MAX
 """Bytes of content one block can carry, hence the longest message."""
-MAX_PARAMETERS: Final = 32
+MAX_PARAMETERS: Final = 16
+"""Of one message; real ones have up to 9."""
 NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _BITS32: Final = 0xFFFFFFFF
 _ALL: Final = -1

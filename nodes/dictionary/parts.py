@@ -9,10 +9,11 @@ from nodes.support.errors import CanductorError
 
 OUTPUT: Final = "#output"
 """Name of the message a debug output decodes to; its one parameter ``text`` is UTF-8."""
-MAX_MESSAGES: Final = 4096
-"""Formats of one kind; real builds have about 120."""
-MAX_ENUMERATION_NAMES: Final = 1 << 16
-"""Names of all enumerations together, ranges spelled out; real builds have up to 3,000."""
+MAX_MESSAGES: Final = 512
+"""Commands, responses and outputs together; real builds have about 150."""
+MAX_ENUMERATIONS: Final = 512
+MAX_ENUMERATION_NAMES: Final = 1 << 14
+"""Names of all enumerations together, ranges spelled out; real builds have up to 3,300."""
 MAX_NAME_LENGTH: Final = 256
 MAX_ID: Final = (1 << 13) - 1
 """Ids are small; two bytes of VLQ reach from -4096 to 12287."""
@@ -48,6 +49,8 @@ def _take_id(value: object, text: str, taken: dict[int, str]) -> int:
         raise DictionaryError(
             f"dictionary: id {value} belongs to both {_shown(taken[value])} and {_shown(text)}"
         )
+    if len(taken) == MAX_MESSAGES:
+        raise DictionaryError(f"dictionary: has more than {MAX_MESSAGES} messages; refused")
     taken[value] = text
     return value
 
@@ -160,7 +163,7 @@ def parse_enumerations(source: object) -> dict[str, Enumeration]:
     """Read all enumerations, bounded together."""
     found: dict[str, Enumeration] = {}
     room = MAX_ENUMERATION_NAMES
-    for name, entries in _object(source, "enumerations", MAX_MESSAGES).items():
+    for name, entries in _object(source, "enumerations", MAX_ENUMERATIONS).items():
         values: dict[str, int] = {}
         for entry, value in _object(entries, f"enumeration {_shown(name)}", MAX_ENUMERATION_NAMES).items():
             first, count = _range(name, entry, value)

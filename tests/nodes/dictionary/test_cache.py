@@ -159,6 +159,20 @@ def test_damaged_addresses_are_ignored(tmp_path: Path, content: str) -> None:
     assert DictionaryCache(tmp_path).of_node("can0/000000000001") is None
 
 
+def test_of_a_node_that_is_known_one_file_is_read(tmp_path: Path) -> None:
+    first, second = build("v1"), build("v2")
+    stored(tmp_path, first).write_bytes(b"damaged")
+    cache = DictionaryCache(tmp_path)
+    dictionary = Dictionary.parse(second.compressed)
+    cache.store(second.compressed, dictionary)
+    cache.remember("can0/000000000001", dictionary)
+    later = DictionaryCache(tmp_path)
+    found = later.of_node("can0/000000000001")
+    assert found is not None
+    assert found.version == "v2"
+    assert later.ignored_files == 0
+
+
 def test_pipes_links_and_huge_files_are_not_read(tmp_path: Path) -> None:
     folder, twin = tmp_path / "cache", build("v1")
     path = stored(folder, twin)
