@@ -15,12 +15,16 @@ and program; its Python is --peer-python. The peer is not a part of this project
 figures of PEER_FIGURES are printed. Three nodes are measured with ours only: the peer cannot reach a virtual
 CAN bus.
 
+With --beside PATH (a checkout of an earlier version, set up) that version and this one print the same program
+by turns, one node, both heaters on, by `run --gcode`: how a figure of another computer compares.
+
 With --limit the hosts run in a control group of 15 % of one core and 200 MB (as root).
 
 The first line says how fast the computer is: a host that is woken some ten times a second does little, but
 finds nothing of what it needs in the caches.
 
 Usage: python bench/realtime.py [--seconds S] [--only STATE ...] [--limit] [--peer PATH [--peer-python PATH]]
+       python bench/realtime.py [--seconds S] --beside PATH
 """
 
 import argparse
@@ -51,6 +55,9 @@ ROOT = Path(__file__).resolve().parents[1]
 ONE_NODE = ROOT / "config" / "cartesian_uart.cfg"
 THREE_NODES = ROOT / "config" / "demo" / "machine.cfg"
 PROGRAM = ROOT / "config" / "demo" / "part.gcode"
+HEATERS_ON = "M140 S60\nM104 S200\n"
+HOMED_S = 30.0
+"""After the start of `run --gcode` the machine has homed, and prints."""
 SETTLE_S = 6.0
 """Left out at the start of each state; the nodes' clocks have settled by then."""
 FILAMENT_MM = 5.0
@@ -221,15 +228,13 @@ def machine(config: Path, folder: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def host(command: list[str], api: Path, folder: Path) -> Iterator[tuple[int, KlippyClient]]:
-    """Run a host with COMMAND; yield its process id and a client once the machine is ready."""
+def running(command: list[str], folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
+    """Run COMMAND, its output in a file in FOLDER, until the block ends."""
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "HOME": str(folder)}
     with (folder / "host.log").open("wb") as log:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
     try:
-        yield process.pid, connect(process, api, folder)
-    except ProcessLookupError:
-        sys.exit(f"the host ended:\n{(folder / 'host.log').read_text()}")
+        yield process
     finally:
         process.send_signal(signal.SIGTERM)
         try:
@@ -237,6 +242,16 @@ def host(command: list[str], api: Path, folder: Path) -> Iterator[tuple[int, Kli
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+@contextlib.contextmanager
+def host(command: list[str], api: Path, folder: Path) -> Iterator[tuple[int, KlippyClient]]:
+    """Run a host with COMMAND; yield its process id and a client once the machine is ready."""
+    with running(command, folder) as process:
+        try:
+            yield process.pid, connect(process, api, folder)
+        except ProcessLookupError:
+            sys.exit(f"the host ended:\n{(folder / 'host.log').read_text()}")
 
 
 def connect(process: "subprocess.Popen[bytes]", api: Path, folder: Path) -> KlippyClient:
@@ -345,7 +360,7 @@ def run_print(
     client: KlippyClient, state: Callable[[str], None], api: Path, chosen: argparse.Namespace
 ) -> None:
     """Measure a host in the states of a print."""
-    client.script("M140 S60\nM104 S200")
+    client.script(HEATERS_ON)
     rounds = ROUNDS if "watched" in chosen.only else 1
     for name in [name for name in ("printing", "watched") if name in chosen.only] * rounds:
         client.script("SDCARD_PRINT_FILE FILENAME=part.gcode")
@@ -375,7 +390,7 @@ def run_states(command: list[str], api: Path, folder: Path, chosen: argparse.Nam
         if "script" in chosen.only:
             measure_script(client)
         if "heating" in chosen.only:
-            client.script("M140 S60\nM104 S200")
+            client.script(HEATERS_ON)
             state("heating")
         if {"printing", "watched"} & set(chosen.only):
             run_print(client, state, api, chosen)
@@ -421,6 +436,22 @@ def play(config: Path, title: str, command: Any, chosen: argparse.Namespace) -> 
             print(f"             it was held back in {group.throttled} periods of 100 ms, start included")
 
 
+def play_beside(beside: Path, seconds: float) -> None:
+    """Measure the version in the checkout BESIDE and this one by turns, as they print a file."""
+    for title, checkout in (("that version", beside), ("this version", ROOT)) * ROUNDS:
+        with tempfile.TemporaryDirectory() as name, machine(ONE_NODE, Path(name)) as played:
+            folder = Path(name)
+            played.write_text(played.read_text().partition(CARD.partition("{")[0])[0])
+            program = folder / "part.gcode"
+            program.write_text(HEATERS_ON + (folder / "jobs" / "part.gcode").read_text())
+            command = [str(checkout / ".venv" / "bin" / "canductor"), "run", str(played)]
+            with running([*command, "--gcode", str(program)], folder) as process:
+                time.sleep(HOMED_S)
+                if process.poll() is not None:
+                    sys.exit(f"the host ended:\n{(folder / 'host.log').read_text()}")
+                measure(title, process.pid, seconds, threads=False)
+
+
 def main() -> None:
     """Measure what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -430,6 +461,7 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=1, help="that watch a print")
     parser.add_argument("--threads", action="store_true", help="print each thread, too")
     parser.add_argument("--limit", action="store_true", help="15 %% of one core and 200 MB; as root")
+    parser.add_argument("--beside", type=Path, help="a checkout of an earlier version, set up")
     parser.add_argument("--peer", type=Path, help="klippy.py of the peer")
     parser.add_argument(
         "--peer-python", default=sys.executable, help="the Python that has what the peer needs"
@@ -437,6 +469,9 @@ def main() -> None:
     chosen = parser.parse_args()
     os.chdir(ROOT)
     print_computer()
+    if chosen.beside is not None:
+        play_beside(chosen.beside.resolve(), chosen.seconds)
+        return
     if 1 in chosen.nodes:
         play(ONE_NODE, "canductor, one node on a UART:", ours, chosen)
     if 3 in chosen.nodes:
