@@ -15,8 +15,8 @@ and program; its Python is --peer-python. The peer is not a part of this project
 figures of PEER_FIGURES are printed. Three nodes are measured with ours only: the peer cannot reach a virtual
 CAN bus.
 
-With --beside PATH (a checkout of an earlier version, set up) that version and this one print the same program
-by turns, one node, both heaters on, by `run --gcode`: how a figure of another computer compares.
+With --compare PATH (a checkout of an earlier version, set up) that version and this one print the same
+program alternately, one node, both heaters on, by `run --gcode`: so figures of two computers compare.
 
 With --limit the hosts run in a control group of 15 % of one core and 200 MB (as root).
 
@@ -24,7 +24,7 @@ The first line says how fast the computer is: a host that is woken some ten time
 finds nothing of what it needs in the caches.
 
 Usage: python bench/realtime.py [--seconds S] [--only STATE ...] [--limit] [--peer PATH [--peer-python PATH]]
-       python bench/realtime.py [--seconds S] --beside PATH
+       python bench/realtime.py [--seconds S] --compare PATH
 """
 
 import argparse
@@ -436,9 +436,9 @@ def play(config: Path, title: str, command: Any, chosen: argparse.Namespace) -> 
             print(f"             it was held back in {group.throttled} periods of 100 ms, start included")
 
 
-def play_beside(beside: Path, seconds: float) -> None:
-    """Measure the version in the checkout BESIDE and this one by turns, as they print a file."""
-    for title, checkout in (("that version", beside), ("this version", ROOT)) * ROUNDS:
+def compare(earlier: Path, seconds: float) -> None:
+    """Measure the version in the checkout EARLIER and this one alternately while they print a file."""
+    for title, checkout in (("earlier", earlier), ("this one", ROOT)) * ROUNDS:
         with tempfile.TemporaryDirectory() as name, machine(ONE_NODE, Path(name)) as played:
             folder = Path(name)
             played.write_text(played.read_text().partition(CARD.partition("{")[0])[0])
@@ -461,7 +461,7 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=1, help="that watch a print")
     parser.add_argument("--threads", action="store_true", help="print each thread, too")
     parser.add_argument("--limit", action="store_true", help="15 %% of one core and 200 MB; as root")
-    parser.add_argument("--beside", type=Path, help="a checkout of an earlier version, set up")
+    parser.add_argument("--compare", type=Path, help="a checkout of an earlier version, set up")
     parser.add_argument("--peer", type=Path, help="klippy.py of the peer")
     parser.add_argument(
         "--peer-python", default=sys.executable, help="the Python that has what the peer needs"
@@ -469,8 +469,8 @@ def main() -> None:
     chosen = parser.parse_args()
     os.chdir(ROOT)
     print_computer()
-    if chosen.beside is not None:
-        play_beside(chosen.beside.resolve(), chosen.seconds)
+    if chosen.compare is not None:
+        compare(chosen.compare.resolve(), chosen.seconds)
         return
     if 1 in chosen.nodes:
         play(ONE_NODE, "canductor, one node on a UART:", ours, chosen)
