@@ -10,6 +10,7 @@ import asyncio
 import ctypes
 import faulthandler
 import functools
+import math
 import os
 import re
 import select
@@ -19,7 +20,8 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from nodes.support.awake import WakingLoop
@@ -103,6 +105,8 @@ class _WatchedSelector(selectors.DefaultSelector):
         """When the loop began to work; 0: it rests."""
         self.rested = False
         """Whether it might have rested before that."""
+        self.wake_by_s = math.inf
+        """It rests until then at most."""
 
     def close(self) -> None:
         super().close()
@@ -110,25 +114,26 @@ class _WatchedSelector(selectors.DefaultSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         self.busy_since_s = 0.0
-        if timeout != 0:  # else it goes on at once, and the timer is restarted
+        self.rested = timeout != 0
+        if self.rested:  # else it goes on at once, and the timer is restarted
             self.timer.disarm()
+            if self.wake_by_s < math.inf:
+                most_s = max(self.wake_by_s - time.monotonic(), 0.0)
+                timeout = most_s if timeout is None else min(timeout, most_s)
         events = super().select(timeout)
         self.busy_since_s = time.monotonic()
         self.timer.arm()
-        self.rested = timeout != 0
         return events
 
 
+@dataclass(slots=True, eq=False)
 class _Flexible:
-    """Something that is called from a time on, when the loop is awake."""
+    """What is called from a time on when the loop is awake, and at a later time at the latest."""
 
-    __slots__ = ("call", "earliest_s", "handle")
-
-    def __init__(self, earliest_s: float, call: Callable[[], None]) -> None:
-        self.earliest_s = earliest_s
-        self.call = call
-        self.handle: asyncio.Handle
-        """Wakes the loop at the latest time; then of the call itself."""
+    earliest_s: float
+    latest_s: float
+    call: Callable[[], None]
+    called: asyncio.Handle | None = None
 
 
 class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
@@ -143,7 +148,6 @@ class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
         self._unhurried: set[int] = set()
         """Descriptors whose events let others go on who have time."""
         super().__init__(self.watched)
-        self.when_awake(self._call_what_has_time)
 
     def when_awake(self, call: Callable[[], None], *, also_by: int | None = None) -> Callable[[], None]:
         """Call CALL whenever a timer or the descriptor ALSO_BY has woken the loop; return what ends that.
@@ -165,13 +169,13 @@ class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
 
     def _process_events(self, event_list: list[tuple[selectors.SelectorKey, int]]) -> None:
         super()._process_events(event_list)  # type: ignore[misc]
-        if not self.watched.rested:
-            return
-        for key, _ in event_list:
-            if key.fd not in self._unhurried:
-                return
-        for call in tuple(self._when_awake):
-            call()
+        now_s = self.watched.busy_since_s
+        if self.watched.rested and self._unhurried.issuperset([key.fd for key, _ in event_list]):
+            self._call_flexible([flexible for flexible in self._flexible if flexible.earliest_s <= now_s])
+            for call in tuple(self._when_awake):
+                call()
+        elif now_s >= self.watched.wake_by_s:
+            self._call_flexible([flexible for flexible in self._flexible if flexible.latest_s <= now_s])
 
     def call_between(
         self, earliest_s: float, latest_s: float, call: Callable[[], None]
@@ -180,29 +184,26 @@ class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
 
         Return what cancels it.
         """
-        flexible = _Flexible(earliest_s, call)
+        flexible = _Flexible(earliest_s, latest_s, call)
         self._flexible.append(flexible)
+        self.watched.wake_by_s = min(self.watched.wake_by_s, latest_s)
 
         def end() -> None:
-            flexible.handle.cancel()
-            if flexible in self._flexible:
-                self._flexible.remove(flexible)
+            if flexible.called is not None:
+                flexible.called.cancel()
+            elif flexible in self._flexible:
+                self._forget(flexible)
 
-        def call_late() -> None:
-            end()
-            call()
-
-        flexible.handle = self.call_at(latest_s, call_late)
         return end
 
-    def _call_what_has_time(self) -> None:
-        if not self._flexible:
-            return
-        now_s = self.time()
-        for flexible in [flexible for flexible in self._flexible if flexible.earliest_s <= now_s]:
-            flexible.handle.cancel()
-            self._flexible.remove(flexible)
-            flexible.handle = self.call_soon(flexible.call)
+    def _call_flexible(self, due: Sequence[_Flexible]) -> None:
+        for flexible in due:
+            self._forget(flexible)
+            flexible.called = self.call_soon(flexible.call)
+
+    def _forget(self, flexible: _Flexible) -> None:
+        self._flexible.remove(flexible)
+        self.watched.wake_by_s = min((other.latest_s for other in self._flexible), default=math.inf)
 
     def pending_signals(self) -> list[int]:
         """Return the numbers of the signals that came and were not handled yet; from any thread."""

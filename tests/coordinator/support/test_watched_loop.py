@@ -136,15 +136,25 @@ def test_what_has_time_wakes_the_loop_at_the_latest() -> None:
     run(test)
 
 
-def test_the_later_time_needs_no_other_occasion() -> None:
-    """Nobody asks the loop whether it is awake: as when the computer slept past both times."""
+def test_the_later_time_needs_no_rest() -> None:
+    """A loop that always has something to do never rests; who has time is called at the later time."""
 
     async def test(loop: WatchedLoop) -> None:
-        came = asyncio.Event()
-        loop._when_awake.clear()
-        call_between(loop.time(), loop.time() + 0.001, came.set)
-        async with asyncio.timeout(NEVER_S):
-            await came.wait()
+        came, done = asyncio.Event(), list[str]()
+        begun_s = loop.time()
+        call_between(begun_s, begun_s + 0.005, came.set)
+        call_between(begun_s, begun_s + NEVER_S, lambda: done.append("it may"))
+
+        def keep_busy() -> None:
+            if not came.is_set():
+                loop.call_soon(keep_busy)
+
+        keep_busy()
+        await came.wait()
+        assert loop.time() - begun_s >= 0.005
+        assert done == []
+        await asyncio.sleep(0.001)
+        assert done == ["it may"]
         assert loop._flexible == []
 
     run(test)
