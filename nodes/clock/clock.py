@@ -63,7 +63,7 @@ def ticks_since(later: int, earlier: int) -> int:
 
 def extend32(clock32: int, near: Ticks) -> Ticks:
     """Return the 64-bit clock whose low bits are CLOCK32 and that is nearest to NEAR."""
-    return Ticks(near + ticks_since(clock32, near % _WHOLE))
+    return Ticks(near + (clock32 - near + _HALF) % _WHOLE - _HALF)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """An analog input on a node: sampled periodically, reported, and monitored by the node itself."""
 
 import math
+import struct
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
@@ -107,9 +108,9 @@ class AnalogIn(Device):
     def _received(self, message: Message) -> None:
         if "values" in message.params:
             data = message.data("values")
-            sums = [int.from_bytes(data[at : at + 2], "little") for at in range(0, len(data) - 1, 2)]
+            sums = struct.unpack_from(f"<{len(data) // 2}H", data)
         else:
-            sums = [message.integer("value")]
+            sums = (message.integer("value"),)
         next_clock = message.integer("next_clock")
         rest_ticks = self._times["rest_ticks"]
         for index, value in enumerate(sums):

@@ -183,7 +183,7 @@ class Dictionary:
 
         None when its id is unknown, it is cut short, or something follows it.
         """
-        found = self.response_at(content)
+        found = _format_at(self._by_prefix, self._responses_by_id, content, 0)
         decoded = found[0].decode(content, found[1]) if found else None
         return decoded[0] if decoded and decoded[1] == len(content) else None
 

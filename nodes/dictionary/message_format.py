@@ -88,16 +88,14 @@ CODES: Final[Mapping[str, Code]] = {
 }
 
 # struct wire_arg as the struct module sees it: the number, and the address behind its padding.
-_ARG_SIZE: Final[int] = ffi.sizeof("struct wire_arg")
 _DATA_AT: Final[int] = ffi.offsetof("struct wire_arg", "data")
 _POINTER_SIZE: Final[int] = ffi.sizeof("uint8_t *")
-_SKIP_POINTER: Final = f"{_ARG_SIZE - 4}x"
 _POINTER: Final = f"{_DATA_AT - 4}x{'Q' if struct.calcsize('=Q') == _POINTER_SIZE else 'I'}"
 
 
 # Looked up once: used for every message.
-_from_buffer: Final = ffi.from_buffer
-_unpack: Final = lib.wire_unpack
+_pack: Final = lib.wire_pack
+_read: Final = lib.message_values
 
 
 class MessageFormat:
@@ -121,15 +119,19 @@ class MessageFormat:
         self._count = len(self.names)
         self._types = ffi.new("uint8_t[]", bytes(code.wire_type for code in self.codes) or b"\0")
         self._args = ffi.new("struct wire_arg[]", max(1, len(names)))
-        self._view = memoryview(ffi.buffer(self._args))
-        self._numbers = struct.Struct("=" + "".join(code.field + _SKIP_POINTER for code in self.codes))
+        self._args_view = memoryview(ffi.buffer(self._args))
+        self._read = ffi.new("struct message_value[]", max(1, len(names)))
+        self._read_view = memoryview(ffi.buffer(self._read))
+        self._numbers = struct.Struct("=" + "".join(f"{code.field}4x" for code in self.codes))
+        """Of a ``struct message_value`` each."""
         self._pairs = struct.Struct("=" + "".join(code.field + _POINTER for code in self.codes))
         self._buffers = tuple(i for i, code in enumerate(self.codes) if code.wire_type == lib.WIRE_BYTES)
-        self._cursor = ffi.new("const uint8_t *[1]")
-        self._out = ffi.new("uint8_t[]", CONTENT_MAX)
-        self._room = memoryview(ffi.buffer(self._out))
         self.prefix = vlq(message_id)
-        self._content_max = CONTENT_MAX - len(self.prefix)
+        self._start = len(self.prefix)
+        self._out = ffi.new("uint8_t[]", CONTENT_MAX)
+        self._content = memoryview(ffi.buffer(self._out))
+        self._content[: self._start] = self.prefix
+        self._out_args = self._out + self._start
 
     def __repr__(self) -> str:
         return f"MessageFormat({self.text!r}, {self.message_id})"
@@ -158,13 +160,13 @@ class MessageFormat:
                 pairs += (value & bits, 0)
             else:
                 raise MessageError(self._unfit(name, value, low, high))
-        self._pairs.pack_into(self._view, 0, *pairs)
-        used: int = lib.wire_pack(self._types, self._count, self._args, self._out, self._content_max)
+        self._pairs.pack_into(self._args_view, 0, *pairs)
+        used: int = _pack(self._types, self._count, self._args, self._out_args, CONTENT_MAX - self._start)
         if not used:
             raise MessageError(
                 f"{self.name}: longer than the {CONTENT_MAX} bytes one block carries; send less at once"
             )
-        return self.prefix + self._room[:used].tobytes()
+        return self._content[: self._start + used].tobytes()
 
     def _buffer(self, name: str, value: Value | str, keep: list[object]) -> tuple[int, int]:
         if not isinstance(value, bytes):
@@ -204,18 +206,16 @@ class MessageFormat:
         """Decode like ``decode``, but return only the parameters' values, in the order of ``names``."""
         if not self._count:
             return (), start
-        held = _from_buffer("uint8_t[]", content)
-        cursor = self._cursor
-        cursor[0] = held + start
-        if _unpack(self._types, self._count, cursor, held + len(content), self._args):
+        end: int = _read(self._types, self._count, content, len(content), start, self._read)
+        if not end:
             return None
-        values: Sequence[Value] = self._numbers.unpack_from(self._view)
+        values: Sequence[Value] = self._numbers.unpack_from(self._read_view)
         if self._buffers:
             values = list(values)
             for i in self._buffers:
-                at = self._args[i].data - held
+                at = self._read[i].at
                 values[i] = content[at : at + values[i]]
-        return values, cursor[0] - held
+        return values, end
 
 
 def vlq(value: int) -> bytes:

@@ -1,8 +1,9 @@
 """Python wrapper of a bus's I/O thread (io_thread.h): links, raw frames, events in the asyncio loop."""
 
 import asyncio
+import struct
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from nodes.link.handle import BusHandle
 from nodes.link.interfaces import OnFrame, OnLost, OnResponses
@@ -26,6 +27,8 @@ from nodes.support.c_structs import from_struct
 
 _BATCH = 128
 """Most events taken from the bus and handled in one turn of the loop, some ms: normal traffic is a dozen."""
+_EVENT: Final = "@2B i 2I 2Q {}s 0Q"
+"""``struct io_event`` as the struct module sees it; to be given the size of a content."""
 
 
 class LinkIO:
@@ -75,6 +78,8 @@ class LinkIO:
         self._lib, self._ffi = driver.lib, driver.ffi
         self._final = self._ffi.new("struct io_stats *")
         self._events = self._ffi.new("struct io_event[]", _BATCH)
+        self._events_view = memoryview(self._ffi.buffer(self._events))
+        self._event = struct.Struct(_EVENT.format(self._lib.WIRE_CONTENT_MAX))
         self._goes_on = False
         """Whether the next turn of the loop takes what is left."""
         self._bugs = BugReports()
@@ -211,16 +216,14 @@ class LinkIO:
         responses: dict[int, list[Response]] = {}
         frames: list[Frame] = []
         notices: list[tuple[int, int, int]] = []
-        for i in range(taken):
-            event = self._events[i]
-            content = bytes(self._ffi.buffer(event.content)[: event.size])
-            if event.notice == self._lib.IO_RESPONSE:
-                response = Response(content, event.sent_ns, event.received_ns)
-                responses.setdefault(event.link, []).append(response)
-            elif event.notice == self._lib.IO_FRAME:
-                frames.append(Frame(event.can_id, content, event.received_ns))
+        events = self._event.iter_unpack(self._events_view[: taken * self._event.size])
+        for notice, size, value, link, can_id, sent_ns, received_ns, content in events:
+            if notice == self._lib.IO_RESPONSE:
+                responses.setdefault(link, []).append(Response(content[:size], sent_ns, received_ns))
+            elif notice == self._lib.IO_FRAME:
+                frames.append(Frame(can_id, content[:size], received_ns))
             else:
-                notices.append((event.notice, event.link, event.value))
+                notices.append((notice, link, value))
         # Frames first: the frame with which a node stops its bus has the reason, later reports do not.
         for frame in frames:
             if self._on_frame:

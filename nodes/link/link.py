@@ -59,9 +59,10 @@ class Link:
         A control command is sent within milliseconds, BULK data when motion and control leave room for it.
         Raises LinkError when the queue is full, the command is too long, or the link is closed or lost.
         """
-        data = self._ffi.from_buffer(content)
         kind = self._lib.LINK_BULK if bulk else self._lib.LINK_CONTROL
-        status = self._lib.io_send(self._live(), self._number, kind, data, len(content), min_clock, req_clock)
+        status = self._lib.io_send(
+            self._live(), self._number, kind, content, len(content), min_clock, req_clock
+        )
         if status != self._lib.IO_OK:
             self._check_command(status, len(content), "bulk" if bulk else "control")
 

@@ -146,11 +146,9 @@ class Node:
     @property
     def best_clock(self) -> EstimatedClock:
         """The best estimate of the node's clock: by sync pulses, else by exchanges; NodeError before."""
-        pulses = self.pulse_clock
+        clock, pulses = self.clock, self.pulse_clock
         # The interrupts of some boards jitter so much that exchanges are more accurate.
-        if pulses is not None and pulses.error_s <= self.clock.estimate().bound_s:
-            return pulses
-        return self.clock
+        return clock if pulses is None or pulses.error_s > clock.estimate().bound_s else pulses
 
     @property
     def clock_source(self) -> ClockSource:
@@ -262,9 +260,10 @@ class Node:
 
     def check_ready(self) -> None:
         """Raise NodeError unless the node is configured and works."""
+        if self.failure is None and self.state is NodeState.READY:
+            return
         self._check_usable()
-        if self.state is not NodeState.READY:
-            raise NodeError(f"node {self.name} is {self.state.value} and not ready yet")
+        raise NodeError(f"node {self.name} is {self.state.value} and not ready yet")
 
     def _check_usable(self) -> None:
         if self.failure is not None:

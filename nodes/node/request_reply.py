@@ -323,13 +323,11 @@ class RequestReply:
                 times = response.sent_ns, response.received_ns
                 waiter.answered.set_result(Answer(message, *times, waiter.asked_bytes, len(response.content)))
                 break
+        callbacks = [*self._listeners.get((message.name, None), ())]
         oid = message.params.get("oid")
         if isinstance(oid, int):
-            self._call((message.name, oid), message)
-        self._call((message.name, None), message)
-
-    def _call(self, key: tuple[str, int | None], message: Message) -> None:
-        for callback in tuple(self._listeners.get(key, ())):
+            callbacks[:0] = self._listeners.get((message.name, oid), ())
+        for callback in callbacks:
             try:
                 callback(message)
             except Exception as bug:  # noqa: BLE001 (other listeners and nodes get theirs all the same)

@@ -1,4 +1,4 @@
-"""cffi module; the functions are documented in firmware/wire/wire.h."""
+"""cffi module; the functions are documented in firmware/wire/wire.h and message_values.h."""
 
 from typing import Any
 

@@ -9,6 +9,11 @@ from nodes.support.native_build import builder
 
 ffibuilder = builder(
     "nodes.support._wire",
-    headers=["firmware/wire/wire.h"],
-    sources=["firmware/wire/vlq.c", "firmware/wire/message.c", "firmware/wire/block.c"],
+    headers=["firmware/wire/wire.h", "nodes/support/message_values.h"],
+    sources=[
+        "firmware/wire/vlq.c",
+        "firmware/wire/message.c",
+        "firmware/wire/block.c",
+        "nodes/support/message_values.c",
+    ],
 )

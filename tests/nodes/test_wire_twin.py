@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.dictionary.message_format import CODES, vlq, vlq_read
+from nodes.dictionary.message_format import CODES, MessageFormat, vlq, vlq_read
 from nodes.support._wire import ffi, lib
 from tests import wire_twin as twin
 
@@ -34,6 +34,25 @@ def test_garbage_as_a_number(data: bytes) -> None:
 @given(st.binary(max_size=80))
 def test_checksum(data: bytes) -> None:
     assert lib.wire_crc16(data, len(data)) == twin.crc16(data)
+
+
+@given(
+    st.lists(st.sampled_from(sorted(CODES)), min_size=1, max_size=5),
+    st.binary(min_size=1, max_size=3),
+    st.binary(max_size=24),
+)
+def test_garbage_as_values(codes: list[str], before: bytes, data: bytes) -> None:
+    expected = twin.decode_values(codes, data)
+    format_ = MessageFormat("garbage", 7, [f"p{i}" for i in range(len(codes))], codes)
+    found = format_.read_values(before + data, len(before))
+    assert (found is None) == (expected is None)
+    if found is None or expected is None:
+        return
+    values, end = found
+    assert end == len(before) + len(data) - len(expected[1])
+    assert [v if isinstance(v, bytes) else v & 0xFFFFFFFF for v in values] == [
+        v if isinstance(v, bytes) else v & 0xFFFFFFFF for v in expected[0]
+    ]
 
 
 @given(st.lists(st.sampled_from(sorted(CODES)), max_size=5), st.binary(max_size=24))
