@@ -7,15 +7,16 @@ from typing import Final
 
 from coordinator.config.saved import SaveError, checked
 from coordinator.runtime.machine import Machine
-from nodes.clock.clock import Ticks, extend32
+from nodes.clock.clock import HostTime, extend32
 from nodes.node.node import Node
 from nodes.support.awake import call_between
 
 AHEAD_S: Final = 0.1
 """How far ahead of now the earliest commands are timed: they need their time to the node."""
 
-SLACK: Final = 0.1
-"""By how much of its period something that is done again and again may be later."""
+SLACK: Final = 0.35
+"""By how much of its period something that is done again and again may be later: sensors that report every
+0.3 s wake the host meanwhile for what comes every second."""
 
 
 class ModuleContext:
@@ -50,13 +51,17 @@ class ModuleContext:
 
     def ticks_at(self, node: str, print_time_s: float) -> int:
         """Return what the clock of a node shows at a print time; 64 bits."""
-        return self._time_base.ticks_at(self.node(node).best_clock, print_time_s)
+        return self._time_base.ticks_at(self.machine.nodes[node].best_clock, print_time_s)
+
+    def ticks_in(self, node: str, seconds: float) -> int:
+        """Return what the clock of a node shows so many seconds from now; 64 bits."""
+        at_ns = HostTime(self.machine.host.now() + round(seconds * 1e9))
+        return self.machine.nodes[node].best_clock.ticks_at(at_ns)
 
     def print_time_of(self, node: str, clock32: int) -> float:
         """Return the print time at which a node's clock shows CLOCK32, the nearest one to now."""
-        clock = self.node(node).best_clock
-        now_ns = self.machine.host.now()
-        ticks = extend32(clock32, Ticks(clock.ticks_at(now_ns)))
+        clock = self.machine.nodes[node].best_clock
+        ticks = extend32(clock32, clock.ticks_at(self.machine.host.now()))
         return self._time_base.print_time_of(clock, ticks)
 
     def soon_on_loop(self, call: Callable[[], None]) -> None:
@@ -67,7 +72,7 @@ class ModuleContext:
     def every(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
         """Call CALL every so many seconds; returns what ends it. All end when the machine closes.
 
-        Calls of one period come together, so that they wake the computer once, and up to a tenth of it later,
+        Calls of one period come together, so that they wake the computer once, and up to SLACK of it later,
         when it is awake anyway: the first comes after half to one and a half periods.
         """
         if seconds not in self._periodic:

@@ -42,10 +42,11 @@ LOOK_S: Final = 1.0
 SILENT_LOOKS: Final = 2
 """How many checks in a row may find none; not a time, as the host itself may have been suspended."""
 
-STALE_SPARE_S: Final = 0.2
+STALE_SPARE_S: Final = 0.15
 """How long before the node would stop it a power is switched off that no measurement has renewed."""
 STALE_EARLY_S: Final = 0.3
-"""So much earlier that is checked when the computer is awake anyway, as for measurements."""
+"""So much earlier that is checked when the computer is awake anyway: with the usual max_duration for the
+third measurement from now on."""
 STALE_AGAIN_S: Final = 0.01
 """Least time until the next check of that."""
 
@@ -334,10 +335,8 @@ class Heater:
         live, self.power = self._live, power
         if live is None or (power <= 0 and not self._on):
             return
-        node = live.node(self.node)
         try:
-            clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)
-            self._output.set(node, clock, power)
+            self._output.set(live.node(self.node), live.ticks_in(self.node, AHEAD_S), power)
         except CanductorError as error:
             self._switch_off(str(error))
             return
@@ -379,8 +378,7 @@ class Heater:
     def _turn_off(self, live: "ModuleContext") -> None:
         if live.node(self.node).state is NodeState.READY:
             with contextlib.suppress(CanductorError):  # then its own max_duration ends it
-                clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)
-                self._output.set(live.node(self.node), clock, 0.0)
+                self._output.set(live.node(self.node), live.ticks_in(self.node, AHEAD_S), 0.0)
 
     def _switch_off(self, why: str) -> None:
         """Clear the target: the node of the heater or of its sensor, which may be absent, is gone."""

@@ -86,9 +86,9 @@ class ScriptedLive:
     def print_time_now(self) -> float:
         return self.host_s + PRINT_OFFSET_S
 
-    def ticks_at(self, node: str, print_time_s: float) -> int:
+    def ticks_in(self, node: str, seconds: float) -> int:
         assert node in self.nodes
-        return round(print_time_s * TICKS_PER_S)
+        return round((self.print_time_now() + seconds) * TICKS_PER_S)
 
     def every(self, seconds: float, call: Callable[[], None]) -> None:
         self.timers.append((seconds, call))

@@ -193,10 +193,10 @@ def test_without_that_section_the_usual_counts(tmp_path: Path, section: str, key
 
 
 def test_power_goes_stale_after_its_time_and_not_at_it(chamber: Driven) -> None:
-    """1.5 s of max_duration, less 0.4 s that values are sent ahead and 0.2 s to spare."""
+    """1.5 s of max_duration, less 0.4 s that values are sent ahead and 0.15 s to spare."""
     unit, live = chamber.unit, chamber.live
     assert [seconds for seconds, _ in live.timers] == [1.0]
-    unit._stale_s = 0.875  # a number that is exact in binary, beside 1.5 - 0.4 - 0.2
+    unit._stale_s = 0.875  # a number that is exact in binary, beside 1.5 - 0.4 - 0.15
     unit.set_target(60.0)
     chamber.measured(20.0)
     live.host_s += 0.875
@@ -226,7 +226,7 @@ def test_one_timer_watches_the_power_however_often_it_is_renewed(chamber: Driven
 
 def test_how_long_power_lasts_follows_from_max_duration(tmp_path: Path) -> None:
     unit = heater(tmp_path, HOTEND_PID + CHAMBER + "max_duration: 3\n", "chamber")
-    assert unit._stale_s == pytest.approx(2.4)
+    assert unit._stale_s == pytest.approx(2.45)
 
 
 def test_three_silent_looks_are_allowed_and_the_fourth_stops(chamber: Driven) -> None:
