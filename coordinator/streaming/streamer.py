@@ -196,10 +196,9 @@ class Streamer:
                     self._machine.stop(f"{self._job.name}:{event.line}: M112 stopped the machine")
                     return
                 self._report_cycle(cycle)
-                if cycle.batches:
-                    await asyncio.sleep(0)  # other tasks wait for one of the two, not for both
-                self._hand_over(cycle)  # last: links and buses begin to work then, and the loop rests
+                self._hand_over(cycle)
                 self._note_delay(cycle, self.print_time_now() - began_s)
+                self._on_cycle()  # last: threads that write what it notes begin to work, and the loop rests
                 if isinstance(event, StandstillAction):
                     await self._attend(event)
                 if (event is not None and not cycle.more) or self.held is not None:
@@ -274,7 +273,6 @@ class Streamer:
     def _report_cycle(self, cycle: Cycle) -> None:
         self._report_output(cycle)
         self._on_state(cycle.planned)
-        self._on_cycle()
 
     def _act(self, due: Sequence[Due]) -> None:
         for print_time_s, timed in due:
@@ -301,6 +299,7 @@ class Streamer:
             cycle = await thread.run(self.worker.rest)
             self._hand_over(cycle)
             self._report_cycle(cycle)
+            self._on_cycle()
             if not ended:
                 await asyncio.sleep(CYCLE_S)
         self._act(self._due.rest())

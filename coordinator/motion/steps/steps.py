@@ -18,6 +18,8 @@ SMOOTH_MAX_S = int(lib.STEP_SMOOTH_MAX_US) / 1e6
 TABLE_POINTS_MAX = int(lib.STEP_TABLE_POINTS)
 """Points of one axis table that step generation has room for."""
 Position = tuple[float, float, float, float]
+_uncleared = ffi.new_allocator(should_clear_after_alloc=False)
+"""For buffers of which only what was written is read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +159,7 @@ class StepGenerator:
     def take_batch(self, node: int, room: int = 1 << 16) -> bytes:
         """Remove and return up to ROOM bytes of NODE's batch (link/core/batch.h), whole records only."""
         self._check_node(node)
-        out = ffi.new("uint8_t[]", room)
+        out = _uncleared("uint8_t[]", room)
         taken = lib.step_take_batch(self._gen, node, out, room)
         return bytes(ffi.buffer(out, taken))
 

@@ -33,6 +33,7 @@ CLOSE_S: Final = 1.0
 FILE_BYTES_MAX: Final = 262_144
 WAITING_MAX: Final = 64
 _VERSION: Final = 1
+_ENCODER: Final = json.JSONEncoder(separators=(",", ":"))
 _INT_END: Final = 2**63
 _NUMBER_END: Final = 1e9
 """Of offsets, factors, temperatures and heights."""
@@ -129,7 +130,7 @@ def _entry(line: bytes) -> dict[str, Any] | None:
 
 
 def _line(entry: Mapping[str, Any]) -> bytes:
-    return json.dumps(entry, separators=(",", ":")).encode() + b"\n"
+    return _ENCODER.encode(entry).encode() + b"\n"
 
 
 class Journal:
@@ -145,7 +146,7 @@ class Journal:
         self._path = path
         self._on_failure = on_failure
         self._clock_s = clock_s
-        self._waiting: queue.Queue[tuple[float, dict[str, Any]] | None] = queue.Queue()
+        self._waiting: queue.SimpleQueue[tuple[float, dict[str, Any]] | None] = queue.SimpleQueue()
         """Entries, and when each came."""
         self._failed = False
         self.left_out = 0
@@ -233,10 +234,13 @@ class Journal:
             fd = open_regular(self._path, os.O_WRONLY | os.O_APPEND)
         except OSError:
             return False
-        with os.fdopen(fd, "ab") as file:
+        try:
             if os.fstat(fd).st_size != size:
                 return False
-            file.write(data)
+            while data:
+                data = data[os.write(fd, data) :]
+        finally:
+            os.close(fd)
         return True
 
     def _sync(self, size: int) -> int:
