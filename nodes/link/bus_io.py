@@ -228,9 +228,7 @@ class LinkIO:
         for frame in frames:
             if self._on_frame:
                 self._guarded("a frame", self._on_frame, frame)
-        if taken > 1 and self._bus.open:
-            self._pass_on_together(responses)
-        else:
+        if responses and self._bus.open:
             self._pass_on(responses)
         for notice in notices:
             self._guarded("a notice", self._handle_notice, *notice)
@@ -243,19 +241,16 @@ class LinkIO:
             except Exception as bug:  # noqa: BLE001
                 self._bugs.add(f"{self.name}: {what}", bug)
 
-    def _pass_on_together(self, responses: Mapping[int, Sequence[Response]]) -> None:
+    def _pass_on(self, responses: Mapping[int, Sequence[Response]]) -> None:
         """Pass RESPONSES on so that the commands that follow from them share blocks."""
         self._lib.io_cork(self._bus.live(), 1)
         try:
-            self._pass_on(responses)
+            for number, batch in responses.items():
+                if link := self._links.get(number):
+                    self._guarded("responses", link.on_responses, batch)
         finally:
             if self._bus.open:
                 self._lib.io_cork(self._bus.live(), 0)
-
-    def _pass_on(self, responses: Mapping[int, Sequence[Response]]) -> None:
-        for number, batch in responses.items():
-            if link := self._links.get(number):
-                self._guarded("responses", link.handle_responses, batch)
 
     def _handle_notice(self, notice: int, number: int, value: int) -> None:
         if notice == self._lib.IO_ENDED:

@@ -2,12 +2,12 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from nodes.link.handle import BusHandle
 from nodes.link.interfaces import OnLost, OnResponses
-from nodes.link.types import Flow, LinkError, LinkSettings, LinkStats, Response
+from nodes.link.types import Flow, LinkError, LinkSettings, LinkStats
 from nodes.support.c_structs import from_struct
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ class Link:
         self._lib, self._ffi = bus.lib, bus.ffi
         self._number = number
         self._settings = settings
-        self._on_responses = on_responses
+        self.on_responses = on_responses
+        """Gets what arrives."""
         self._on_lost = on_lost
         self._name = bus.name if settings.nodeid is None else f"{bus.name} node {settings.nodeid}"
         self.on_silent: Callable[[], None] = _ignore
@@ -153,10 +154,6 @@ class Link:
         self._on_close(self._number)
 
     # ------------------------------------------------------------------------- called by LinkIO
-
-    def handle_responses(self, responses: Sequence[Response]) -> None:
-        """Pass on what arrived."""
-        self._on_responses(responses)
 
     def handle_drained(self) -> None:
         """Wake the tasks that wait in drained()."""

@@ -199,7 +199,8 @@ class RequestReply:
         self, name: str, args: Mapping[str, Value | str] = _NO_ARGS, *, min_clock: int = 0, req_clock: int = 0
     ) -> None:
         """Send a command with ARGS; clocks as in ``nodes/link/core/batch.h``. Raises MessageError."""
-        self.link.send(self.encode(name, args), min_clock=min_clock, req_clock=req_clock)
+        link = self._link or self.link
+        link.send(self.encode(name, args), min_clock=min_clock, req_clock=req_clock)
 
     def send_text(self, command: str) -> None:
         """Send a command written as text; raises MessageError."""

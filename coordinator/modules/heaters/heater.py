@@ -285,7 +285,8 @@ class Heater:
             return
         self._apply(self._wanted(live, at_s, celsius))
         ended = self._holding.measured(at_s, celsius, self.target_c, self.power, settled=self.settled)
-        self._report_held(ended)
+        if ended is not None:
+            self._report_held(ended)
 
     def _report_held(self, held: Held | None) -> None:
         if held is not None and self.on_held is not None:

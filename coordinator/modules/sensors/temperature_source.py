@@ -107,7 +107,8 @@ class TemperatureSource:
             self.on_measured(at_s(self._live), celsius)
             self.unhandled = False
         self._looks = 0
-        self.wake()
+        if self._waiting:
+            self.wake()
 
     def _watch(self, live: "ModuleContext", celsius: float) -> None:
         """Stop the machine when CELSIUS stays outside the limits: for sensors that no node checks."""
