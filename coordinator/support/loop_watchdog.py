@@ -107,6 +107,8 @@ class _WatchedSelector(selectors.DefaultSelector):
         """Whether it might have rested before that."""
         self.wake_by_s = math.inf
         """It rests until then at most."""
+        self._armed_s = 0.0
+        """When the timer was set."""
 
     def close(self) -> None:
         super().close()
@@ -115,14 +117,16 @@ class _WatchedSelector(selectors.DefaultSelector):
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         self.busy_since_s = 0.0
         self.rested = timeout != 0
-        if self.rested:  # else it goes on at once, and the timer is restarted
+        if self.rested:
             self.timer.disarm()
             if self.wake_by_s < math.inf:
                 most_s = max(self.wake_by_s - time.monotonic(), 0.0)
                 timeout = most_s if timeout is None else min(timeout, most_s)
         events = super().select(timeout)
-        self.busy_since_s = time.monotonic()
-        self.timer.arm()
+        self.busy_since_s = now_s = time.monotonic()
+        if self.rested or now_s > self._armed_s + AGAIN_S:  # else it has time for this turn, too
+            self._armed_s = now_s
+            self.timer.arm()
         return events
 
 
@@ -144,9 +148,8 @@ class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
     def __init__(self) -> None:
         self.watched = _WatchedSelector()
         self._flexible: list[_Flexible] = []
-        self._when_awake: list[Callable[[], None]] = []
-        self._unhurried: set[int] = set()
-        """Descriptors whose events let others go on who have time."""
+        self._when_awake: dict[Callable[[], None], int | None] = {}
+        """With the descriptor whose events come to the same, and let others go on who have time."""
         super().__init__(self.watched)
 
     def when_awake(self, call: Callable[[], None], *, also_by: int | None = None) -> Callable[[], None]:
@@ -156,24 +159,21 @@ class WatchedLoop(asyncio.SelectorEventLoop, WakingLoop):
 
         It must be quick and not raise; what it has to do is for ``call_soon``, behind what has come.
         """
-        self._when_awake.append(call)
-        if also_by is not None:
-            self._unhurried.add(also_by)
+        self._when_awake[call] = also_by
 
         def end() -> None:
-            self._when_awake.remove(call)
-            if also_by is not None:
-                self._unhurried.remove(also_by)
+            del self._when_awake[call]
 
         return end
 
     def _process_events(self, event_list: list[tuple[selectors.SelectorKey, int]]) -> None:
         super()._process_events(event_list)  # type: ignore[misc]
-        now_s = self.watched.busy_since_s
-        if self.watched.rested and self._unhurried.issuperset([key.fd for key, _ in event_list]):
+        now_s, fds = self.watched.busy_since_s, {key.fd for key, _ in event_list}
+        if self.watched.rested and fds.issubset(self._when_awake.values()):
             self._call_flexible([flexible for flexible in self._flexible if flexible.earliest_s <= now_s])
-            for call in tuple(self._when_awake):
-                call()
+            for call, fd in tuple(self._when_awake.items()):
+                if fd not in fds:
+                    call()
         elif now_s >= self.watched.wake_by_s:
             self._call_flexible([flexible for flexible in self._flexible if flexible.latest_s <= now_s])
 
