@@ -61,7 +61,11 @@ class HeaterCheck:
         """
         elapsed_s = 0.0 if self._last_s is None else min(max(now_s - self._last_s, 0.0), LONGEST_STEP_S)
         self._last_s = now_s
-        stuck = self._check_stuck(now_s, measured_c, power)
+        stuck = None
+        if power > 0:
+            self._off_since_s = None
+        else:
+            stuck = self._check_stuck(now_s, measured_c)
         if target_c <= 0:
             self._target_c = self.error_ks = 0.0
             self._reached = False
@@ -116,10 +120,7 @@ class HeaterCheck:
             f"its range of {self.options.hysteresis_k:g} K); check heater, sensor and what cools them"
         )
 
-    def _check_stuck(self, now_s: float, measured_c: float, power: float) -> str | None:
-        if power > 0:
-            self._off_since_s = None
-            return None
+    def _check_stuck(self, now_s: float, measured_c: float) -> str | None:
         if self._off_since_s is None:
             self._off_since_s = now_s
         options = self.options

@@ -113,6 +113,8 @@ class Node:
         self._keeper: ClockKeeper | None = None
         self._watchdog = NodeWatchdog(name, 0)
         self._explain: list[ExplainShutdown] = []
+        self._reports_wait: tuple[bool, bool] | None = None
+        """What ``let_reports_wait`` has set since the start: whether measurements and state wait for long."""
         self._starting_over = True  # messages count only once an old configuration was checked
         self._reaching = False  # a link that is lost now is one attempt that failed
         self._generation = 0
@@ -219,10 +221,12 @@ class Node:
 
         A node whose CLOCK nothing needs closely is asked for it less often.
         """
-        with contextlib.suppress(CanductorError):  # there is no link, or it is lost
-            for response, rests in {MEASURED: measurements, **dict.fromkeys(STATE, state)}.items():
-                seconds = REST_PATIENCE_S if rests else PATIENCE_S[response]
-                self._talk.let_wait(response, seconds, in_step=response == MEASURED and not rests)
+        if self._reports_wait != (measurements, state):
+            with contextlib.suppress(CanductorError):  # there is no link, or it is lost
+                for response, rests in {MEASURED: measurements, **dict.fromkeys(STATE, state)}.items():
+                    seconds = REST_PATIENCE_S if rests else PATIENCE_S[response]
+                    self._talk.let_wait(response, seconds, in_step=response == MEASURED and not rests)
+                self._reports_wait = measurements, state
         if self._keeper is not None:
             self._keeper.rests = clock
 
@@ -297,6 +301,7 @@ class Node:
         await self._wait_for_clock(keeper)
         for response, seconds in PATIENCE_S.items():
             self._talk.let_wait(response, seconds)
+        self._reports_wait = None
         self._enter(NodeEvent.CONFIGURED)
 
     async def _prepare(self) -> tuple[ClockKeeper, NodeConfig, Message]:
