@@ -198,7 +198,7 @@ class Streamer:
                 self._report_cycle(cycle)
                 self._hand_over(cycle)
                 self._note_delay(cycle, self.print_time_now() - began_s)
-                self._on_cycle()  # last: threads that write what it notes begin to work, and the loop rests
+                self._on_cycle()  # last: threads begin to write what it notes, and the loop rests
                 if isinstance(event, StandstillAction):
                     await self._attend(event)
                 if (event is not None and not cycle.more) or self.held is not None:

@@ -11,6 +11,7 @@ import pytest
 
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.service.jobs.journal import journal_path
+from nodes.link.link import Link
 from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served
 
@@ -78,6 +79,28 @@ async def print_until(printer: Printer, stage: Served, at_mm: float, further_s: 
     await gcode(stage, "EXCLUDE_OBJECT NAME=B")
     await stage.until(lambda: height(printer) == at_mm, f"{at_mm} mm")
     await asyncio.sleep(further_s)
+
+
+def test_new_heights_are_noted_before_what_leads_to_them_is_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed in between, the service would go on from a height at which the head is no more."""
+    printer, sent = Printer(tmp_path, SECTIONS), list[tuple[object, object]]()
+
+    async def test(stage: Served) -> None:
+        recovery, hand_over = stage.service.recovery, Link.send_batch
+
+        def send_batch(link: Link, batch: bytes) -> None:
+            if recovery._job is not None and recovery._job.line:
+                sent.append((recovery._heights_noted, recovery._heights()))
+            hand_over(link, batch)
+
+        monkeypatch.setattr(Link, "send_batch", send_batch)
+        await print_until(printer, stage, 0.65, 1.0)
+
+    printer.serve(test)
+    assert len({there for _, there in sent}) > 1
+    assert [noted for noted, _ in sent] == [there for _, there in sent]
 
 
 def test_it_heats_homes_above_the_part_and_goes_on(tmp_path: Path) -> None:

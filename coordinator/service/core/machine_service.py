@@ -308,6 +308,7 @@ class MachineService:
             machine,
             on_output=self.report,
             on_cycle=on_cycle,
+            on_planned=self._note_new_heights,
             record=self._record,
             compensation=self.tables.compensation_of(machine),
             has_jobs=has_jobs,
@@ -316,6 +317,11 @@ class MachineService:
             pass_by_what_stays()
         self._enter(ServiceState.READY)
         return motion
+
+    def _note_new_heights(self) -> None:
+        """Write down new heights before the commands that lead to them are handed over."""
+        if self.recovery.has_new_heights():
+            self.look()
 
     @contextlib.asynccontextmanager
     async def _stop_on_failure(self, machine: Machine) -> AsyncIterator[None]:

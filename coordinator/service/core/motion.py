@@ -27,7 +27,8 @@ DWELL_S: Final = 2.0
 class Motion:
     """Moves MACHINE, whose nodes are READY.
 
-    ON_OUTPUT gets replies and notices, ON_CYCLE is called at the end of every cycle. RECORD keeps all that is
+    ON_OUTPUT gets replies and notices. ON_PLANNED is called in every cycle before its commands are handed
+    over, ON_CYCLE at its end. RECORD keeps all that is
     planned, for a proof. COMPENSATION has the tables of the axes. HAS_JOBS: whether programs control jobs;
     else the one that runs is all there is.
     """
@@ -38,6 +39,7 @@ class Motion:
         *,
         on_output: Callable[[ProgramOutput], None],
         on_cycle: Callable[[], None],
+        on_planned: Callable[[], None] = lambda: None,
         record: PlanRecord | None = None,
         compensation: Compensation | None = None,
         has_jobs: bool = True,
@@ -61,7 +63,7 @@ class Motion:
             witness=self.trace,
             compensation=compensation,
             on_output=on_output,
-            on_state=self._cycle_ended,
+            on_state=self._cycle_made,
             on_cycle=on_cycle,
             at_rest=self._at_rest,
         )
@@ -72,6 +74,7 @@ class Motion:
         """Works so far that have moved anything."""
         self._ending: list[QueuedWork] = []
         self._waited_for: dict[QueuedWork, asyncio.Future[None]] = {}
+        self._on_planned = on_planned
 
     async def run(self) -> None:
         """Move until ``finish``, or until the machine stops; raises as the streamer does."""
@@ -156,7 +159,7 @@ class Motion:
 
     # ----------------------------------------------------------------------------------- cycle by cycle
 
-    def _cycle_ended(self, planned: Planned) -> None:
+    def _cycle_made(self, planned: Planned) -> None:
         self.planned = planned
         self.begun.set()
         now_s = self.now_s
@@ -169,6 +172,7 @@ class Motion:
             while True:
                 self._ending.append(self.feeder.finished.popleft())
         self._ending = [queued for queued in self._ending if not self._settle(queued, now_s)]
+        self._on_planned()
 
     def _at_rest(self) -> bool:
         """Return whether nothing is left to be done or reported."""

@@ -195,6 +195,11 @@ class Recovery:
             fed = job.lines_fed is not None
             self._journal.begin(job.file, job.size_bytes, self._modified_ns, fed=fed)
 
+    def has_new_heights(self) -> bool:
+        """Return whether the job leads to other heights than are written down."""
+        job = self._job
+        return job is not None and job.active and self._heights() != self._heights_noted
+
     def look(self) -> None:
         """Write down how far the job is."""
         job, journal, now_s = self._job, self._journal, self._service.now_s

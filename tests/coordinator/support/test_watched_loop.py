@@ -63,6 +63,23 @@ def test_who_has_sent_something_does_not_wait_for_what_has_time() -> None:
     run(test)
 
 
+def test_what_has_time_does_not_wait_for_ever_for_those_who_send() -> None:
+    async def test(loop: WatchedLoop) -> None:
+        came = asyncio.Event()
+        reads, writes = os.pipe()
+        loop.add_reader(reads, lambda: None)  # there is always something to read
+        os.write(writes, b"?")
+        begun_s = loop.time()
+        call_between(begun_s, begun_s + 0.005, came.set)
+        await came.wait()
+        assert loop.time() - begun_s >= 0.005
+        loop.remove_reader(reads)
+        os.close(reads)
+        os.close(writes)
+
+    run(test)
+
+
 def test_what_nobody_waits_for_takes_along_what_has_time() -> None:
     async def test(loop: WatchedLoop) -> None:
         done: list[str] = []

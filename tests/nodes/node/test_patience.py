@@ -187,6 +187,8 @@ def test_a_node_that_is_ready_lets_what_comes_all_the_time_wait() -> None:
         machine.io.links[-1].failure = None
         await machine.node.restart()
         assert patience_s(MEASURED) == PATIENCE_S[MEASURED]
+        machine.node.let_reports_wait(measurements=True, state=True, clock=True)
+        assert patience_s(MEASURED) == REST_PATIENCE_S, "a restart ends what was set before"
 
     machine.run(machine.bus.start, check)
     machine.node.let_reports_wait(

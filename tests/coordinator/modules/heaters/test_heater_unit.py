@@ -196,7 +196,7 @@ def test_power_goes_stale_after_its_time_and_not_at_it(chamber: Driven) -> None:
     """1.5 s of max_duration, less 0.4 s that values are sent ahead and 0.15 s to spare."""
     unit, live = chamber.unit, chamber.live
     assert [seconds for seconds, _ in live.timers] == [1.0]
-    unit._stale_s = 0.875  # a number that is exact in binary, beside 1.5 - 0.4 - 0.15
+    unit._stale_s = 0.875  # exact in binary; 1.5 - 0.4 - 0.15 is not
     unit.set_target(60.0)
     chamber.measured(20.0)
     live.host_s += 0.875
