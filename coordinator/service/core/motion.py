@@ -28,9 +28,8 @@ class Motion:
     """Moves MACHINE, whose nodes are READY.
 
     ON_OUTPUT gets replies and notices. ON_PLANNED is called in every cycle before its commands are handed
-    over, ON_CYCLE at its end. RECORD keeps all that is
-    planned, for a proof. COMPENSATION has the tables of the axes. HAS_JOBS: whether programs control jobs;
-    else the one that runs is all there is.
+    over, ON_CYCLE at its end. RECORD keeps all that is planned, for a proof. COMPENSATION has the tables of
+    the axes. HAS_JOBS: whether programs control jobs; else the one that runs is all there is.
     """
 
     def __init__(
