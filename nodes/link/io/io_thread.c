@@ -21,6 +21,8 @@
 // full frame lasts 111 µs and more.
 #define NO_BUFFERS_NS 300000ULL
 #define OVERSLEPT_NS 2000000ULL
+// A deadline that moves by less, as with each acknowledgement, leaves the timer as it is: it is early.
+#define TIMER_EARLY_NS 5000000ULL
 
 enum { KERNEL_FRAMES = 16, FRAME = sizeof(struct can_frame), SKB_BYTES = 768, WRITES = 32 };
 
@@ -166,14 +168,18 @@ static void release(struct io_thread *thread) {
 
 // Wakes the thread at AT_NS; UINT64_MAX: never. A timer that has expired is readable until it is set again.
 static void set_timer(struct io_thread *thread, uint64_t at_ns) {
-    if (at_ns == thread->sleep_until_ns)
-        return;
     thread->sleep_until_ns = at_ns;
     struct itimerspec timer = {0}; // disarmed
     if (at_ns != UINT64_MAX)
         timer.it_value =
             (struct timespec){.tv_sec = (time_t)(at_ns / NS_PER_S), .tv_nsec = (long)(at_ns % NS_PER_S)};
     timerfd_settime(thread->timer_fd, TFD_TIMER_ABSTIME, &timer, NULL);
+}
+
+// Whether the timer is set to a time so near before AT_NS that it may stay.
+static int timer_suits(const struct io_thread *thread, uint64_t now, uint64_t at_ns) {
+    uint64_t set_ns = thread->sleep_until_ns;
+    return now < set_ns && set_ns <= at_ns && at_ns - set_ns < TIMER_EARLY_NS;
 }
 
 // Sleeps until the descriptor, a caller or the timer wakes it; returns the descriptor's events.
@@ -185,7 +191,9 @@ static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
         {.fd = thread->timer_fd, .events = POLLIN}};
     if (thread->kernel_full)
         fds[0].events |= POLLOUT;
-    set_timer(thread, next_deadline(thread, now));
+    uint64_t at_ns = next_deadline(thread, now);
+    if (!timer_suits(thread, now, at_ns))
+        set_timer(thread, at_ns);
     release(thread);
     poll(fds, 3, -1); // on failure: no events
     if (fds[1].revents & POLLIN)
