@@ -64,22 +64,22 @@ class _Timer:
     """A timer of the kernel that a thread can wait for; the calls take about a microsecond."""
 
     def __init__(self, first_s: float, again_s: float) -> None:
-        self._libc: Any = ctypes.PyDLL(None, use_errno=True)
-        self.fd: int = self._libc.timerfd_create(_CLOCK_MONOTONIC, _TIMER_FLAGS)
+        self.fd: int = ctypes.PyDLL(None, use_errno=True).timerfd_create(_CLOCK_MONOTONIC, _TIMER_FLAGS)
         """Readable when ``has_expired``."""
         if self.fd < 0:
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number))
+        self._set: Any = ctypes.PyDLL(None).timerfd_settime  # without errno, for which ctypes takes a while
         self._armed = ctypes.byref(_Times(0, round(again_s * 1e9), 0, round(first_s * 1e9)))
         self._at_rest = ctypes.byref(_Times(0, 0, 0, 0))
 
     def arm(self) -> None:
         """Begin, from now on."""
-        self._libc.timerfd_settime(self.fd, 0, self._armed, None)
+        self._set(self.fd, 0, self._armed, None)
 
     def disarm(self) -> None:
         """Expire no more."""
-        self._libc.timerfd_settime(self.fd, 0, self._at_rest, None)
+        self._set(self.fd, 0, self._at_rest, None)
 
     def has_expired(self) -> bool:
         """Return whether it has expired since this was called last, or since it was set."""
