@@ -33,6 +33,7 @@ enum {
     STEP_TRAPEZOIDS = 4096, // moves the generator holds
     STEP_BUFFER = 8192,     // steps of one stepper that wait for compression
     STEP_SEGMENTS = 8192,   // segments of one stepper that wait to be merged
+    STEP_SEGMENT_MS = 50,   // between the first step of a segment and its last: it cannot be taken back
     STEP_OUT_BYTES = 1 << 18,
     STEP_MOVE_COUNT_MAX = 65535,
     STEP_TIE = 1 << 20, // a tie is decided by more than 1/STEP_TIE of a step

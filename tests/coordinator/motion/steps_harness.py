@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
+from coordinator.motion.steps._steps import lib
 from coordinator.motion.steps.steps import StepGenerator
 from tests.coordinator.motion.steps_oracle import Move, Node, Position, Step, step_times
 from tests.stages.resting_step import resting_steps
@@ -110,6 +111,8 @@ class Run:
             assert counted.commands == len(node.records)
             assert counted.content_bytes == sum(record.size for record in node.records)
             steps = [record for record in node.records if record.name == "queue_step"]
+            longest = (lib.STEP_SEGMENT_MS * 1e-3 + 2 * self.max_error_s) * node.spec.clock_freq
+            assert all(record.finish - record.first <= longest for record in steps)
             assert counted.late_slots == sum(record.min_clock > record.first for record in steps)
         for i, s in enumerate(stats.steppers):
             mine = [r for r in self.nodes[self.steppers[i].node].records if r.oid == self.steppers[i].oid]

@@ -34,20 +34,22 @@ static struct fit_problem make_problem(void) {
     }
     const struct step_bands bands = {ticks, STEPS, -per_us / v0, t + per_us / v0, 12.5 * per_us, low, high};
     step_bands(&bands);
-    return (struct fit_problem){ticks, low, high, STEPS, (uint32_t)chance(1, 100), clock, 2};
+    const uint32_t most = chance(0, 1) < 0.5 ? FIT_COUNT_MAX : (uint32_t)chance(1, 100);
+    return (struct fit_problem){ticks, low, high, STEPS, most, (uint32_t)chance(1, 100), clock, 2};
 }
 
 // The most steps that ADD reaches, whatever the interval.
 static uint32_t reach(const struct fit_problem *p, double add) {
     double least = p->shortest, most = 4294967295.0;
-    for (uint32_t i = 0; i < p->count; i++) {
+    const uint32_t count = p->count < p->most ? p->count : p->most;
+    for (uint32_t i = 0; i < count; i++) {
         const double n = i + 1.0, bent = add * n * (n - 1) / 2;
         least = fmax(least, ceil((p->low[i] - p->clock - bent) / n));
         most = fmin(most, floor((p->high[i] - p->clock - bent) / n));
         if (least > most || least + add * i < p->shortest)
             return i;
     }
-    return p->count;
+    return count;
 }
 
 static uint32_t longest(const struct fit_problem *p) {

@@ -70,11 +70,27 @@ struct search {
     const struct step_arithmetic *arithmetic;
     size_t begin;   // of the stretch, in the buffer
     uint32_t count; // its steps
+    double longest; // segment, ticks
     double force;   // a segment that begins before this time need not wait for steps to come
     struct way ways[DEPTH + 1][WAYS]; // best first
     int found[DEPTH + 1];
     struct fit fits[WAYS]; // of the ways of the level looked at
 };
+
+// Returns how many steps a segment may have that begins with the first of COUNT at TICKS.
+static uint32_t most_of(const double *ticks, uint32_t count, double longest) {
+    uint32_t least = 1, most = count < FIT_COUNT_MAX ? count : FIT_COUNT_MAX;
+    if (ticks[most - 1] - ticks[0] <= longest)
+        return FIT_COUNT_MAX;
+    while (least < most) {
+        const uint32_t middle = (least + most + 1) / 2;
+        if (ticks[middle - 1] - ticks[0] <= longest)
+            least = middle;
+        else
+            most = middle - 1;
+    }
+    return least;
+}
 
 static struct fit_problem problem_behind(const struct search *q, const struct way *way) {
     const size_t i = q->begin + way->at;
@@ -83,6 +99,7 @@ static struct fit_problem problem_behind(const struct search *q, const struct wa
         .low = q->s->low + i,
         .high = q->s->high + i,
         .count = q->count - way->at,
+        .most = most_of(q->s->ticks + i, q->count - way->at, q->longest),
         .expected = way->segment.count,
         .clock = way->clock,
         .shortest = (double)q->s->pulse_ticks,
@@ -341,7 +358,8 @@ static int compress_stretch(struct step_gen *gen, struct stepper *s, size_t *fro
         const int64_t clock = begin_segment(s, *from, &first);
         struct search q;
         q.s = s, q.arithmetic = gen->arithmetic, q.begin = *from, q.count = (uint32_t)(end - *from),
-        q.force = force, q.margin = s->max_error_ticks < COARSE_TICKS ? HUGE_VAL : MARGIN;
+        q.longest = STEP_SEGMENT_MS * 1e-3 * s->clock->ticks_per_s, q.force = force,
+        q.margin = s->max_error_ticks < COARSE_TICKS ? HUGE_VAL : MARGIN;
         const int depth = search(&q, (double)clock, s->expected);
         if (!depth && s->ticks[*from] < force)
             return step_fail(gen, STEP_NO_FIT, s, clock_print_time(s->clock, s->ticks[*from], s->base), 0);

@@ -195,7 +195,7 @@ void VARIANT(step_fit_find)(const struct fit_problem *p, struct fit *f) {
     memset(f->count, 0, sizeof(f->count));
     f->open = false;
     f->extra = 0;
-    const uint32_t count = between(p->count, 0, FIT_COUNT_MAX);
+    const uint32_t count = between(p->count, 0, p->most);
     if (!count)
         return;
     const int32_t gates = lay_out(p, f, count),
@@ -206,7 +206,7 @@ void VARIANT(step_fit_find)(const struct fit_problem *p, struct fit *f) {
     const int32_t ticks = last * f->stride;
     if (last && ticks > p->high[ticks - 1] - p->low[ticks - 1])
         last = last_between(p, f, last, -1, 1, NULL, &s);
-    f->open = p->count <= FIT_COUNT_MAX && (uint32_t)((last + 1) * f->stride) > count;
+    f->open = p->count <= p->most && (uint32_t)((last + 1) * f->stride) > count;
     if (last)
         find_ends(p, f, gates, last);
     if (!f->count[0] && !f->count[1] && !f->count[2])
@@ -281,7 +281,7 @@ static uint32_t make_good(const struct fit_problem *p, struct fit *f, int end, s
         // Between places, and up to the last step when that is near, it may reach on.
         const uint32_t rest = p->count - s->count, near = s->count / 8 + 1;
         uint32_t most = s->count + (rest <= near ? rest : (uint32_t)f->stride - 1);
-        most = most < FIT_COUNT_MAX ? most : FIT_COUNT_MAX;
+        most = most < p->most ? most : p->most;
         const uint32_t good = count_good(p, s, most);
         if (good >= s->count || f->extra == FIT_EXTRA)
             return good;

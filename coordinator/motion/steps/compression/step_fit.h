@@ -17,8 +17,8 @@
 #include <stdint.h>
 
 enum {
-    FIT_ENDS = 3, // where in its band a segment may end: below, about and above the true time
-    FIT_COUNT_MAX = 65535,
+    FIT_ENDS = 3,          // where in its band a segment may end: below, about and above the true time
+    FIT_COUNT_MAX = 65535, // as the wire has it
     FIT_ADD_MAX = 32767,
     FIT_GATES = 24,
     FIT_EXTRA = 4, // gates looked at because a segment missed them
@@ -29,6 +29,7 @@ enum {
 struct fit_problem {
     const double *ticks, *low, *high; // due times and their bands
     uint32_t count;
+    uint32_t most;     // that a segment may have, up to FIT_COUNT_MAX
     uint32_t expected; // about how many steps a segment will reach: how finely to look
     double clock;      // whole ticks
     double shortest;   // interval
