@@ -37,20 +37,21 @@ class BusOverloadDetector:
         now: HostTime,
         repeated: Callable[[], float],
         taken: Callable[[], float],
-    ) -> None:
+    ) -> bool:
         """Take the newest forecast; raises BusOverload when motion would be late for certain.
 
+        Returns whether it may be: look again after PERSISTS_S, also if nothing more is sent.
         REPEATED returns the share of the blocks on this bus that had to be sent again, TAKEN the share of its
         time that received frames took lately, acknowledgements and those of low priority aside.
         """
         warning_s = forecast.warning_s
         if warning_s is None:
             self._late_since_ns = None
-            return
+            return False
         if self._late_since_ns is None:
             self._late_since_ns = now
         if now - self._late_since_ns < PERSISTS_S * 1e9 and warning_s > URGENT_S:
-            return
+            return True
         late = f"the first step commands would be late in {max(warning_s, 0):.1f} s"
         if (share := taken()) > BLOCKED:
             raise BusOverload(

@@ -347,16 +347,21 @@ class Machine:
         """Return the counters of every bus that is open, by its name."""
         return {o.bus.name: o.bus.io.stats() for o in self._open if o.bus.is_open}
 
-    def check_load(self) -> None:
-        """Raise BusOverload when a bus will not carry the motion queued on it in time."""
+    def check_load(self) -> bool:
+        """Raise BusOverload when a bus will not carry the motion queued on it in time.
+
+        Return whether one may not: call it again soon, also if nothing more is sent.
+        """
+        doubtful = False
         for opened in self._open:
             if opened.bus.is_open:
-                opened.watch.look(
+                doubtful |= opened.watch.look(
                     opened.bus.io.forecast(),
                     self.host.now(),
                     functools.partial(_repeated, opened.bus),
                     functools.partial(_taken, opened.bus),
                 )
+        return doubtful
 
     def let_reports_wait(self, *, rests: bool) -> None:
         """Let what nodes report wait where nothing depends on it; call it again and again.

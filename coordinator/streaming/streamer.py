@@ -88,6 +88,8 @@ class Streamer:
         computer needs as much more lead."""
         self._busy = False
         """Whether a bus is busy, as of the last cycle."""
+        self._doubtful = False
+        """Whether a bus may not carry what is queued on it in time."""
         self._pause = Pause()
         """Between two cycles."""
         self._alone = False
@@ -208,7 +210,7 @@ class Streamer:
 
     def _cycle_s(self, cycle: Cycle) -> float:
         """Return after which time the next cycle has something to do, unless somebody calls."""
-        if self.held is not None:
+        if self.held is not None or self._doubtful:
             return CYCLE_S
         ahead_s = self.worker.steps.generated_until - self.print_time_now()
         if isinstance(cycle.event, Full) and ahead_s > MAKE_AHEAD_S - CYCLE_S:
@@ -260,10 +262,10 @@ class Streamer:
             self._machine.modules.before_motion(cycle.stepping)
         for node, batch in cycle.batches:
             link_of(self._nodes[node]).send_batch(batch)
-        if cycle.batches:
-            if self._witness is not None:
-                self._witness.see_sent(cycle.batches, cycle.planned)
-            self._machine.check_load()
+        if cycle.batches and self._witness is not None:
+            self._witness.see_sent(cycle.batches, cycle.planned)
+        if cycle.batches or self._doubtful:
+            self._doubtful = self._machine.check_load()
 
     def _report_output(self, cycle: Cycle) -> None:
         for output in cycle.output:

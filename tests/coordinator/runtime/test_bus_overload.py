@@ -19,17 +19,18 @@ def look(
     late_in_s: float | None,
     repeated: float = 0.01,
     taken: float = 0.6,
-) -> None:
-    watch.look(forecast(now_s, late_in_s), HostTime(round(now_s * 1e9)), lambda: repeated, lambda: taken)
+) -> bool:
+    now = HostTime(round(now_s * 1e9))
+    return watch.look(forecast(now_s, late_in_s), now, lambda: repeated, lambda: taken)
 
 
 def test_a_passing_doubt_is_no_overload() -> None:
     watch = BusOverloadDetector("can0")
-    look(watch, 1.0, 1.0)
-    look(watch, 1.0 + PERSISTS_S / 2, 1.0)
-    look(watch, 1.0 + PERSISTS_S * 0.9, None)
-    look(watch, 1.0 + PERSISTS_S * 1.1, 1.0)
-    look(watch, 1.0 + PERSISTS_S * 1.9, 1.0)
+    assert look(watch, 1.0, 1.0)
+    assert look(watch, 1.0 + PERSISTS_S / 2, 1.0)
+    assert not look(watch, 1.0 + PERSISTS_S * 0.9, None)
+    assert look(watch, 1.0 + PERSISTS_S * 1.1, 1.0)
+    assert look(watch, 1.0 + PERSISTS_S * 1.9, 1.0)
 
 
 def test_a_lasting_one_is_said_long_before_the_first_late_step() -> None:
