@@ -25,7 +25,7 @@ from nodes.support.errors import CanductorError
 from nodes.support.work_thread import WorkThread
 
 CYCLE_S: Final = 0.05
-FULL_CYCLE_S: Final = 0.9
+FULL_CYCLE_S: Final = 1.2
 """While planner and commands reach as far ahead as they may; taken off the lead of MAKE_AHEAD_S."""
 FULL_EARLY_S: Final = 0.1
 """So much earlier it comes when the loop is awake anyway."""

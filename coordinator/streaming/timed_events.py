@@ -10,7 +10,7 @@ from typing import Final
 
 from coordinator.gcode.events import AS_SOON_AS_POSSIBLE, Timed
 
-AHEAD_S: Final = 1.3
+AHEAD_S: Final = 1.6
 """The longest cycle (streamer.py), and what outputs need (modules/outputs/timing.py)."""
 
 Due = tuple[float, Timed]

@@ -30,10 +30,10 @@ from coordinator.streaming.move_source import MoveSource, Planned, ProgramOutput
 from coordinator.streaming.pipeline import Pipeline, PlanRecord
 from coordinator.streaming.timed_events import Due
 
-PLAN_AHEAD_S: Final = 2.0
+PLAN_AHEAD_S: Final = 2.3
 """Moves are planned so far ahead of now; beyond, the g-code waits. A pause takes so long; what it leaves
 beyond MAKE_AHEAD_S is for sources that stall, and for lines that take longer to read than to carry out."""
-MAKE_AHEAD_S: Final = 1.5
+MAKE_AHEAD_S: Final = 1.8
 """Step commands are made so far ahead of now; the clocks of the nodes are predicted over this long. Links
 send them later (LinkSettings.ahead_s), so that less goes on when this program is gone."""
 START_LEAD_S: Final = 0.25

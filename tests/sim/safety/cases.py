@@ -26,8 +26,8 @@ STEPS_S: Final = 0.02
 """Within this nothing moves any more after an emergency stop: commands of the stop, over the bus."""
 LEFT_ALONE_S: Final = 1.25
 """Steps are sent 1.2 s ahead: so long a machine may go on that loses its host."""
-PYTHON_STALLS_S: Final = 1.55
-"""Steps are made 1.5 s ahead, and sent by threads that need no Python."""
+PYTHON_STALLS_S: Final = 1.85
+"""Steps are made 1.8 s ahead, and sent by threads that need no Python."""
 NODE_LOST_S: Final = 1.5
 """So long the other nodes may go on after one is cut off: motion is sent every 0.3 s, and the host waits a
 second for an acknowledgement, and then for an answer."""
