@@ -22,7 +22,7 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.status import MotionStatus
 from coordinator.motion.planner.planner import Planner
-from coordinator.motion.steps.steps import Issued, StepGenerator
+from coordinator.motion.steps.steps import SHORT_S, Issued, StepGenerator
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.timebase import ClockMap, JumpWatch
 from coordinator.streaming.compensation import Compensation
@@ -102,7 +102,8 @@ class MotionWorker:
         """Create step generation, again whenever something else has moved the steppers."""
         machine, witness = self._machine, self._witness
         self._made: dict[str, int] = {}
-        self.steps = StepGenerator(machine.devices.stepper_specs(), machine.stream_specs())
+        specs = machine.devices.stepper_specs()
+        self.steps = StepGenerator(specs, machine.stream_specs(), longest_s=SHORT_S)
         self.pipeline = Pipeline(
             self._job,
             self.steps,

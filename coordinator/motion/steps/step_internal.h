@@ -190,7 +190,7 @@ struct step_gen {
     double assumed; // s, up to which a flush took the machine to rest
     double until;   // s, end of the last complete slice
     double slice;   // s, end of the slice in work; UNTIL when none is
-    double moves_end, max_error_s;
+    double moves_end, max_error_s, longest_s;
     struct step_error error;
 };
 

@@ -14,7 +14,7 @@ static const double ROUNDING_MM_S = 1e-6; // of speeds
 
 static bool is_legal(const struct step_config *c) {
     bool ok = c->stepper_count >= 0 && c->stepper_count <= STEP_MAX_STEPPERS && c->node_count >= 0 &&
-              c->node_count <= STEP_MAX_NODES && step_in_range(c->max_error_s, 0, 1);
+              c->node_count <= STEP_MAX_NODES && step_in_range(c->max_error_s, 0, 1) && c->longest_s >= 0;
     for (int i = 0; ok && i < AXES; i++)
         ok = fabs(c->start[i]) < LONGEST_S;
     for (int i = 0; ok && i < c->node_count; i++)
@@ -103,6 +103,7 @@ struct step_gen *step_gen_init(void *memory, const struct step_config *config) {
     gen->node_count = config->node_count;
     gen->arithmetic = step_arithmetic();
     gen->max_error_s = config->max_error_s;
+    gen->longest_s = config->longest_s > 0 ? config->longest_s : HUGE_VAL;
     gen->moves_end = -LONGEST_S;
     gen->error.stepper = -1;
     memcpy(gen->rest, config->start, sizeof(gen->rest));

@@ -33,7 +33,6 @@ enum {
     STEP_TRAPEZOIDS = 4096, // moves the generator holds
     STEP_BUFFER = 8192,     // steps of one stepper that wait for compression
     STEP_SEGMENTS = 8192,   // segments of one stepper that wait to be merged
-    STEP_SEGMENT_MS = 50,   // between the first step of a segment and its last: it cannot be taken back
     STEP_OUT_BYTES = 1 << 18,
     STEP_MOVE_COUNT_MAX = 65535,
     STEP_TIE = 1 << 20, // a tie is decided by more than 1/STEP_TIE of a step
@@ -85,7 +84,8 @@ struct step_config {
     const struct step_stepper_config *steppers; // read by init only
     const struct step_node_config *nodes;
     double max_error_s;
-    double start[4]; // mm, where the axes stand; steppers count steps from here
+    double start[4];  // mm, where the axes stand; steppers count steps from here
+    double longest_s; // of a command, first step to last; 0: no limit
 };
 
 // What is added to an axis's planned position, at the end of the last move that was appended.
@@ -138,7 +138,8 @@ struct step_gen;
 const struct step_formula *step_find_formula(const char *name);
 
 // Bytes that init needs, or 0 when CONFIG is not legal: counts within the limits above, node indices in
-// range, every length, frequency and error finite and > 0, ids in 32 bits, max_error at least one tick.
+// range, every length, frequency and error finite and > 0, longest_s ≥ 0, ids in 32 bits, max_error at least
+// one tick.
 size_t step_gen_size(const struct step_config *config);
 
 // Whether SURFACE can be a bed: counts and lengths in range, slopes and fading not steeper than 1/2.

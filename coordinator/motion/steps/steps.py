@@ -12,6 +12,8 @@ from nodes.support.c_structs import from_struct
 
 MAX_ERROR_S = 12.5e-6
 """How far a step may be from its true time by default."""
+SHORT_S = 0.05
+"""So long a command lasts at most on a machine: one that has begun goes on, even if the host is gone."""
 SMOOTH_MIN_S = int(lib.STEP_SMOOTH_MIN_US) / 1e6
 SMOOTH_MAX_S = int(lib.STEP_SMOOTH_MAX_US) / 1e6
 """Of a smooth time, but for 0."""
@@ -100,7 +102,8 @@ class StepGenerator:
     """Turns trapezoids into every node's queue_step stream; one thread at a time.
 
     START is where the axes X Y Z E stand (mm); steppers count their steps from there. MAX_ERROR_S bounds how
-    far a step may be from its true time. Clocks begin as ticks = print time * clock_freq. After a StepError
+    far a step may be from its true time, LONGEST_S how long a command lasts, from its first step to its last
+    (0: as long as it fits). Clocks begin as ticks = print time * clock_freq. After a StepError
     of append or generate the generator stays failed.
     """
 
@@ -111,9 +114,11 @@ class StepGenerator:
         *,
         max_error_s: float = MAX_ERROR_S,
         start: Position = (0.0, 0.0, 0.0, 0.0),
+        longest_s: float = 0.0,
     ) -> None:
         self._steppers, self._nodes = tuple(steppers), tuple(nodes)
         config = _config(self._steppers, self._nodes, max_error_s, start)
+        config.struct.longest_s = longest_s
         size = lib.step_gen_size(config.struct)
         if not size:
             raise StepError(

@@ -13,7 +13,7 @@ from typing import Final
 from coordinator.config.model import StepperDescription
 from coordinator.motion.moves import Move
 from coordinator.motion.specs import StepperSpec
-from coordinator.motion.steps.steps import StepGenerator
+from coordinator.motion.steps.steps import SHORT_S, StepGenerator
 from coordinator.runtime.machine import Machine, link_of
 from coordinator.runtime.timebase import JumpWatch
 
@@ -129,7 +129,7 @@ class SingleMove:
             specs = [_by_itself(spec, ways.get(spec.name, 0.0)) for spec in specs]
         self._jumps = JumpWatch((machine.primary, *self._nodes))
         self._jumps.look(now, self.end_s)
-        self._steps = StepGenerator(specs, machine.stream_specs())
+        self._steps = StepGenerator(specs, machine.stream_specs(), longest_s=SHORT_S)
         self._maps = [machine.clock_map(self._time_base, node, now) for node in self._nodes]
         for index, clock_map in enumerate(self._maps):
             piece = clock_map.last

@@ -81,7 +81,7 @@ static struct step_gen *shaped(void *memory, const struct step_config *c) {
 }
 
 int main(void) {
-    const struct step_config c = {STEPPERS, 1, steppers, nodes, 12.5e-6, {30, 20, 5, 0}};
+    const struct step_config c = {STEPPERS, 1, steppers, nodes, 12.5e-6, {30, 20, 5, 0}, 0};
     void *memory = malloc(step_gen_size(&c));
     struct step_gen *gen = shaped(memory, &c);
     double at[AXES] = {30, 20, 5, 0}, time = step_next_move(gen);

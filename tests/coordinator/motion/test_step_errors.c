@@ -16,7 +16,7 @@ static const struct step_stepper_config steppers[] = {
     {1, 1, &formula_winch, {0, 0, 0, 0}, {-100, 0, 500}, 0.01, 0, 2e-6},
 };
 static const struct step_node_config nodes[] = {{168e6, 512, 11, 200, -3}, {16e6, 512, 11, 12, 13}};
-static const struct step_config config = {2, 2, steppers, nodes, 12.5e-6, {0, 0, 0, 0}};
+static const struct step_config config = {2, 2, steppers, nodes, 12.5e-6, {0, 0, 0, 0}, 0};
 static const double start[4] = {1, 2, 3, 4}, zeros[4];
 static const double rising[] = {0, 10, 20}, even[] = {0, 0, 0}, falling[] = {0, 20, 10};
 

@@ -224,7 +224,8 @@ static bool go_on(struct search *q, int level, struct branch *branches, int coun
     return found && ways[0].at == q->count;
 }
 
-// Whether the last segment of WAY, which may be as long as a slow move, has to be on its way.
+// Whether the last segment of WAY, which may be as long as a slow move where nothing limits it, has to be on
+// its way.
 static bool is_urgent(const struct search *q, const struct way *way) {
     return q->s->ticks[q->begin + way->at - way->segment.count] < q->force;
 }
@@ -358,7 +359,7 @@ static int compress_stretch(struct step_gen *gen, struct stepper *s, size_t *fro
         const int64_t clock = begin_segment(s, *from, &first);
         struct search q;
         q.s = s, q.arithmetic = gen->arithmetic, q.begin = *from, q.count = (uint32_t)(end - *from),
-        q.longest = STEP_SEGMENT_MS * 1e-3 * s->clock->ticks_per_s, q.force = force,
+        q.longest = gen->longest_s * s->clock->ticks_per_s, q.force = force,
         q.margin = s->max_error_ticks < COARSE_TICKS ? HUGE_VAL : MARGIN;
         const int depth = search(&q, (double)clock, s->expected);
         if (!depth && s->ticks[*from] < force)

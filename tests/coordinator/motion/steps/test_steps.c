@@ -19,7 +19,7 @@ static const struct step_stepper_config steppers[] = {
 static const struct step_node_config nodes[] = {{168e6, 5, 11, 200, -3}, {16e6, 1024, 11, 12, 13}};
 
 static struct step_config config(void) {
-    return (struct step_config){3, 2, steppers, nodes, 12.5e-6, {0, 0, 0, 0}};
+    return (struct step_config){3, 2, steppers, nodes, 12.5e-6, {0, 0, 0, 0}, 0};
 }
 
 static uint32_t state = 1;

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.motion.steps._steps import lib
-from coordinator.motion.steps.steps import StepGenerator
+from coordinator.motion.steps.steps import SHORT_S, StepGenerator
 from tests.coordinator.motion.steps_harness import (
     MACHINES,
     MAX_ERROR_S,
@@ -58,12 +58,12 @@ cut_shares = st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=6)
 
 
 @pytest.mark.parametrize("machine", MACHINES)
-@given(moves=chains())
+@given(moves=chains(), longest_s=st.sampled_from([0.0, SHORT_S]))
 @settings(max_examples=examples(40))
-def test_every_step_is_in_its_band(machine: str, moves: list[Move]) -> None:
+def test_every_step_is_in_its_band(machine: str, moves: list[Move], longest_s: float) -> None:
     if not moves:
         return
-    run = Run(MACHINES[machine])
+    run = Run(MACHINES[machine], longest_s=longest_s)
     run.play(moves)
     run.check(moves)
 
