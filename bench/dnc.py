@@ -20,10 +20,10 @@ from random import Random
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from coordinator.dnc import events
 from coordinator.dnc.driver import Driver
 from coordinator.dnc.options import DncOptions, read_frame
 from coordinator.dnc.port import Port
+from coordinator.dnc.protocol import events
 from coordinator.dnc.protocol.engine import Engine
 from tests.coordinator.dnc.cable import Cable
 from tests.coordinator.dnc.line import Faults, Line, Owner, Wire

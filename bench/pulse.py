@@ -2,8 +2,8 @@
 
 ``bench/pulse.py [SEEDS]``: for every setting, over SEEDS seeds (2 unless told), three nodes on a CAN bus at
 1 Mbit/s, whose receive interrupts come 0..1 µs after the frame, ramp their clocks apart by up to 10 ppm in
-600 s from 60 s on. The error is that of the map by which steps are timed, made 1.2 s ahead and bent every
-50 ms as when a job streams: the true time at which the secondary reaches the mapped tick, less the one at
+600 s from 60 s on. The error is that of the map by which steps are timed, made 1.8 s ahead and bent every
+1.2 s as when a job streams: the true time at which the secondary reaches the mapped tick, less the one at
 which the primary reaches the print time. "estimate" is the same of the fit itself, asked for the present.
 Both from 10 s after the start, over all seeds and secondary nodes. "bound" is the median of the published
 error bound, "held" how often the estimate was within it.
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from coordinator.runtime.timebase import ClockMap, TimeBase
 from coordinator.simulate.boards import dictionary_blob
-from coordinator.streaming.streamer import CYCLE_S
-from coordinator.streaming.worker import SEND_AHEAD_S
+from coordinator.streaming.streamer import CYCLE_S, FULL_CYCLE_S
+from coordinator.streaming.worker import MAKE_AHEAD_S
 from nodes.bus.assign import Uuid
 from nodes.bus.can_bus import CanBus
 from nodes.clock.clock import HostTime, Ticks
@@ -196,17 +196,21 @@ async def play(machine: Machine, errors: Errors) -> None:
     began_s = loop.time()
     primary = machine.nodes[0]
     time_base = TimeBase(primary.clock, primary.clock_freq_hz)
-    begin = time_base.print_time_at(HostTime(machine.world.now_ns)) + SEND_AHEAD_S
+    begin = time_base.print_time_at(HostTime(machine.world.now_ns)) + MAKE_AHEAD_S
     followers = [Follower(time_base, node, begin) for node in machine.nodes[1:]]
     ramps = [(RAMP_FROM_S, True), (RAMP_FROM_S + RAMP_S, False)]
+    made_s = 0.0
     while (passed_s := loop.time() - began_s) < UNTIL_S:
         if ramps and passed_s >= ramps[0][0]:
             machine.ramp(begins=ramps.pop(0)[1])
         machine.disturb()
         await asyncio.sleep(CYCLE_S)
+        if passed_s < made_s + FULL_CYCLE_S:
+            continue
+        made_s = passed_s
         now_ns = HostTime(machine.world.now_ns)
         for follower, board in zip(followers, machine.boards[1:], strict=True):
-            follower.step(time_base.print_time_at(now_ns) + SEND_AHEAD_S)
+            follower.step(time_base.print_time_at(now_ns) + MAKE_AHEAD_S)
             if passed_s >= SCORED_AFTER_S:
                 look(machine, follower.node, board, errors)
     score(machine, followers, errors)
@@ -222,7 +226,7 @@ def look(machine: Machine, node: Node, board: WorldNode, errors: Errors) -> None
 
 
 def score(machine: Machine, followers: Sequence[Follower], errors: Errors) -> None:
-    skip = round((SCORED_AFTER_S + SEND_AHEAD_S) / CYCLE_S)
+    skip = round((SCORED_AFTER_S + MAKE_AHEAD_S) / FULL_CYCLE_S)
     primary_hz = machine.nodes[0].clock_freq_hz
     for follower, board in zip(followers, machine.boards[1:], strict=True):
         due = true_s(machine.boards[0], [p * primary_hz for p in follower.print_times[skip:]])

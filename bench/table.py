@@ -18,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from nodes.clock.clock import HostTime
-from nodes.mt.cost import FRAME_BITS_MAX, RegisterCost
+from nodes.mt.cost import RegisterCost
 from nodes.mt.download import BUS_SHARE, DownloadReport, download
 from nodes.mt.mt import transmission
 from nodes.mt.table import Activation
@@ -27,6 +27,8 @@ from tests.nodes.mt.machines import TableMachine, wavy
 
 T = TypeVar("T")
 
+FRAME_BITS_MAX = 135
+"""Of 8 bytes: 111, and 24 stuff bits at most (ISO 11898-1)."""
 POLL_DELAY_S = 0.002
 """T of an old drive that polls its register a thousand times a second."""
 BUSY, LOSS = 0.7, 0.01

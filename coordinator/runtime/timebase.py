@@ -19,9 +19,9 @@ from nodes.support.errors import CanductorError
 STEER_HORIZON_S = 1.0
 """A difference to the estimate is worked off over this long: shorter follows faster, longer is smoother.
 
-With sync pulses at 1 µs of interrupt jitter the estimate is good for 0.2 µs rms, and the map, made 1.2 s
-ahead, for 0.3 µs: it follows well enough. A change-over from exchanges to pulses, some 10 µs apart, bends the
-rate by no more than 10 ppm.
+With sync pulses at 1 µs of interrupt jitter the estimate is good for 0.24 µs rms, and the map, made 1.8 s
+ahead, for 0.34 µs: it follows well enough. A change-over from exchanges to pulses, some 10 µs apart, bends
+the rate by no more than 10 ppm.
 """
 
 SLEW_LIMIT = 500e-6
